@@ -138,14 +138,14 @@ def numbers(overlay: Overlay, member: str) -> list[int]:
 
 def test_frames_of_a_link_are_lost_doubled_and_delayed_as_configured(overlay: Overlay) -> None:
     until(lambda: numbers(overlay, "R"), "a message")
-    overlay.disturb("s1", "s2", FrameFaults(lost=1.0))
+    overlay.links.set("s1", "s2", FrameFaults(lost=1.0))
     begun = max(numbers(overlay, "P"))
     until(lambda: max(numbers(overlay, "P"), default=0) > begun + 50, "half a second of messages")
     assert max(numbers(overlay, "R"), default=0) < begun + 20
     for faults in (FrameFaults(doubled=1.0), FrameFaults(delayed=0.5)):
-        overlay.disturb("s1", "s2", faults)
+        overlay.links.set("s1", "s2", faults)
         until(lambda: numbers(overlay, "R"), "a message")
-    overlay.calm("s1", "s2")
+    overlay.links.clear("s1", "s2")
     until(lambda: numbers(overlay, "R"), "a message")
 
 
@@ -155,7 +155,7 @@ def test_a_killed_process_is_started_again_and_a_frozen_one_goes_on(overlay: Ove
     assert "member P" not in overlay.processes
     overlay.start("member P")
     overlay.processes["member P"].read(READY_S)
-    assert overlay.incarnation_ids["member P"] == 2
+    assert len(overlay.lives["member P"]) == 2
     until(lambda: numbers(overlay, "R"), "a message of its new life")
     overlay.freeze("member R")
     overlay.thaw("member R")

@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -28,13 +27,10 @@ from skeleton import Options, Outcome, command_line, run_bench
 
 from fog.supervisor.core.record import Record
 from gdp.enrolment.registry import Registry
-from lab.process import FailedError, new_run
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from lab.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
 from lab.debian import BootedMachine, debian_root, why_not
 from lab.namespaces import Space
+from lab.process import FailedError, new_run
 
 if TYPE_CHECKING:
     from lab.ec2 import DataCenter
@@ -91,7 +87,7 @@ def measure(options: Options) -> Outcome:
             site.run("down", CLUSTER)
             over.add(BASELINE, DOWN, COLUMN, time.monotonic() - begun_s)
         targets = [over.target("token to serving replica, s", BASELINE, WHOLE, COLUMN, TARGET_S, at_most=True)]
-    settings = {"rounds": options.rounds, "commands on the robot's side": 0}
+    settings = {"commands on the robot's side": 0}
     return Outcome("cloud_boot", "From a token to a serving replica", over, targets, settings)
 
 

@@ -20,7 +20,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from report import Rounds, progress
+from report import Rounds, Settings, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.errors import LocalError
@@ -92,8 +92,7 @@ def measure(options: Options) -> Outcome:
         over.target("commands that edit or copy a file", BASELINE, TYPED, FOREIGN, 0, at_most=True),
         over.target("first command to first image, s", BASELINE, TIMES, WHOLE, 90, at_most=True),
     ]
-    settings = {
-        "rounds": options.rounds,
+    settings: Settings = {
         "delay of each uplink, ms": _DELAY_MS,
         "commands": [f"{each.machine}: {each.text}" for each in commands],
         "tutorial, SHA-256": hashlib.sha256(PAGE.read_bytes()).hexdigest(),

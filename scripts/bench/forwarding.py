@@ -1,6 +1,6 @@
 """Forwarding bench: frames a second through three switches, and the round trip of one frame, next to a Linux bridge.
 
-    sudo .venv/bin/python scripts/bench/forwarding.py                      a minute; JSON and plot to docs/benchmarks
+    sudo .venv/bin/python scripts/bench/forwarding.py                      a minute; JSON to docs/benchmarks
     sudo .venv/bin/python scripts/bench/forwarding.py --quick --no-save    a few seconds, to see that all works
 
 ::
@@ -23,8 +23,7 @@ from functools import partial
 from typing import Final
 
 from forwarding_end import SINK, SOURCE
-from plot import Panel, panel_of
-from report import Rounds, Target, percentile
+from report import percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 
 from gdp.frame.codec import ETHERTYPE, OVERHEAD_BYTES, Header, Kind, encode
@@ -32,7 +31,7 @@ from gdp.host.run_registry import Run
 from gdp.limits import HOPS_MAX
 from lab.machines import Lab
 from lab.namespaces import mac_addresses
-from lab.process import FailedError, LabProcess, UndoneOnExit, new_run
+from lab.process import FailedError, LabProcess, new_run
 from lab.topology import chain
 
 KERNEL, BRIDGE = "kernel", "bridge"
@@ -60,21 +59,19 @@ def data_frame(macs: bytes, size: int, destination: bytes, source: bytes) -> byt
     return macs + ETHERTYPE.to_bytes(2, "big") + encode(header) + bytes(payload)
 
 
-class Row(Lab, UndoneOnExit):
-    """The five machines, with source and sink running; a context manager that ends these. Raises as ``Lab``."""
+class Row(Lab):
+    """The five machines, with source and sink running until ``stack`` closes. Raises as ``Lab``."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Run, stack: ExitStack) -> None:
         super().__init__(run, chain(5))
         nodes = self.topology.nodes
         self._macs = {node: self.inside(node, partial(mac_addresses, self.topology.neighbours(node))) for node in nodes}
-        with ExitStack() as undo:
-            self._source, self._sink = (
-                undo.enter_context(self._worker(node, "end", cpu=cpu, ifname=self.topology.neighbours(node)[0]))
-                for node, cpu in ((nodes[0], _SOURCE_CPU), (nodes[-1], _SINK_CPU))
-            )
-            self._source.read(_READY_S)
-            self._sink.read(_READY_S)
-            self._undo = undo.pop_all()
+        self._source, self._sink = (
+            stack.enter_context(self._worker(node, "end", cpu=cpu, ifname=self.topology.neighbours(node)[0]))
+            for node, cpu in ((nodes[0], _SOURCE_CPU), (nodes[-1], _SINK_CPU))
+        )
+        self._source.read(_READY_S)
+        self._sink.read(_READY_S)
 
     @contextmanager
     def kernel(self) -> Iterator[Mapping[str, str]]:
@@ -145,18 +142,11 @@ def measure_one(row: Row, baseline: str, seconds: float, pings: int, _: int) -> 
     return {**best, TRIP: statistics.median(trips), TRIP_P99: percentile(trips, 0.99)}
 
 
-def targets_of(over: Rounds) -> list[Target]:
-    """Return the targets of the kernel plane."""
-    return [
-        over.ratio(f"{CASE}: kernel / bridge, frames/s", KERNEL, BRIDGE, CASE, RATE, GAIN),
-        over.ratio(f"{CASE}: kernel / bridge, RTT median", KERNEL, BRIDGE, CASE, TRIP, None, at_most=True),
-    ]
-
-
 def measure(options: Options) -> Outcome:
     """Measure both, round by round."""
     recorder, pings = Recorder(), int(options.pings)
-    with new_run() as run, Row(run) as row:
+    with new_run() as run, ExitStack() as stack:
+        row = Row(run, stack)
         columns = (RATE, LOSS, TRIP, TRIP_P99)
         trials = [
             Trial(CASE, name, columns, partial(measure_one, row, name, options.seconds, pings))
@@ -165,29 +155,21 @@ def measure(options: Options) -> Outcome:
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
     settings = {
-        "rounds": options.rounds,
         "seconds a try": options.seconds,
         "pings": pings,
         "loss below": LOSS_MAX,
         "cores": f"source {_SOURCE_CPU}, sink {_SINK_CPU}, switches anywhere",
         "trouble": recorder.notes or "none",
     }
-    return Outcome("forwarding", "Forwarding", over, targets_of(over), settings, lambda: panels_of(over))
-
-
-def panels_of(over: Rounds) -> list[Panel]:
-    """Return panels of rates and round trips."""
-    both = (KERNEL, BRIDGE)
-    return [
-        panel_of(over, CASE, RATE, both, ours=(KERNEL,)),
-        panel_of(over, CASE, TRIP, both, p99=TRIP_P99, ours=(KERNEL,)),
+    targets = [
+        over.ratio(f"{CASE}: kernel / bridge, frames/s", KERNEL, BRIDGE, CASE, RATE, GAIN),
+        over.ratio(f"{CASE}: kernel / bridge, RTT median", KERNEL, BRIDGE, CASE, TRIP, None, at_most=True),
     ]
+    return Outcome("forwarding", "Forwarding", over, targets, settings)
 
 
 if __name__ == "__main__":
     quick = {"rounds": 1, "seconds": 0.15, "pings": 200}
-    parser = command_line(
-        __doc__, rounds=7, seconds=0.3, seconds_of="length of one try", quick=quick, has_record=True, has_plot=True
-    )
-    parser.add_argument("--pings", type=int, default=PINGS, help="in each round (default: %(default)s)")
+    parser = command_line(__doc__, rounds=7, seconds=0.3, quick=quick, has_record=True)
+    parser.set_defaults(pings=PINGS)
     run_bench(parser, measure)

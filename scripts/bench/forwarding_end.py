@@ -8,17 +8,17 @@ wake-up for each would be paid by the sender, in whose time the kernel forwards.
 from __future__ import annotations
 
 import gc
-import json
 import os
 import socket
 import struct
 import sys
 import time
 from array import array
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from typing import Any, Final
 
-from peers.jsonl import order_waits, read_order, say
+from peers.jsonl import order_waits, read_order, run_role, say
 
 from gdp.errors import LocalError
 from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
@@ -97,7 +97,7 @@ def count_frames(ifname: str) -> dict[str, float]:
             time.sleep(_NAP_S)
 
 
-def ping(ifname: str, frame: bytes, pings: int) -> list[float]:
+def ping(ifname: str, frame: bytes, pings: int) -> dict[str, list[float]]:
     """Return round-trip times in microseconds; a frame is sent again when the last one is back.
 
     Lost frames are left out. The function gives up after three lost frames.
@@ -114,10 +114,10 @@ def ping(ifname: str, frame: bytes, pings: int) -> list[float]:
                 lost += 1
             else:
                 times.append(now() - start)
-    return [each * 1e6 for each in times[_WARM:]]
+    return {"rtt_us": [each * 1e6 for each in times[_WARM:]]}
 
 
-def answer_pings(ifname: str, frame: bytes, pings: int) -> int:
+def answer_pings(ifname: str, frame: bytes, pings: int) -> dict[str, int]:
     """Answer as many pings as ``ping`` sends, with ``frame``, or until none comes for a while; return their number."""
     answered, memory = 0, bytearray(_FRAME_MAX)
     with open_end(ifname) as sock:
@@ -130,7 +130,7 @@ def answer_pings(ifname: str, frame: bytes, pings: int) -> int:
                 break
             sock.send(frame)
             answered += 1
-    return answered
+    return {"answered": answered}
 
 
 def switch(ways: dict[str, str]) -> None:
@@ -161,18 +161,14 @@ def end(ifname: str, cpu: int) -> None:
     say(event="ready")
     gc.freeze()
     gc.disable()
+    work: Mapping[str, Callable[..., Mapping[str, object]]]
+    work = {"send": send, "count": count_frames, "ping": ping, "answer": answer_pings}
     while True:
         order: dict[str, Any] = read_order()
-        frame = bytes.fromhex(order.get("frame", ""))
-        if order["do"] == "send":
-            say(**send(ifname, frame, order["seconds"]))
-        elif order["do"] == "count":
-            say(**count_frames(ifname))
-        elif order["do"] == "ping":
-            say(rtt_us=ping(ifname, frame, order["pings"]))
-        elif order["do"] == "answer":
-            say(answered=answer_pings(ifname, frame, order["pings"]))
+        if "frame" in order:
+            order["frame"] = bytes.fromhex(order["frame"])
+        say(**work[order.pop("do")](ifname, **order))
 
 
 if __name__ == "__main__":
-    (switch if sys.argv[1] == "switch" else end)(**json.loads(sys.argv[2]))
+    run_role({"switch": lambda settings: switch(**settings), "end": lambda settings: end(**settings)})

@@ -31,7 +31,7 @@ TARGET: Final = 5.0
 _IMAGE: Final = streams(RELIABLE)[0]
 
 
-def goodput(lab: Lab, link: Conditions, name: str, options: Options) -> dict[str, float]:
+def goodput(lab: Lab, link: Conditions, name: str, options: Options, _: int) -> dict[str, float]:
     """Return the figures of one system on a link."""
     used, reports = exchange(lab, link, SYSTEMS[name], options, with_tcp=False)
     return {
@@ -50,10 +50,10 @@ def measure(options: Options) -> Outcome:
             lab = thin_link_lab(run)
             for name in ROWS:
                 work = partial(goodput, lab, link, name, options)
-                trial = Trial(link.name, name, (GOODPUT, SHARE, LATE), lambda _, work=work: work())  # type: ignore[misc]
+                trial = Trial(link.name, name, (GOODPUT, SHARE, LATE), work)
                 recorder.attempt(trial, number, options.rounds)
     over: Rounds = recorder.rounds
-    settings = {"rounds": options.rounds, "seconds of each figure": options.seconds, "TCP": "cubic"}
+    settings = {"seconds of each figure": options.seconds, "TCP": "cubic"}
     settings["trouble"] = recorder.notes or "none"
     targets = [
         over.ratio(f"{GOODPUT}: {OURS} / {other}", OURS, other, link.name, GOODPUT, TARGET if at == 0 else 1.0)

@@ -29,9 +29,9 @@ from background_load import LOADS, SHARE, load_of
 from peers.chain import Chain
 from peers.exchange import ANSWER
 from peers.systems import BASELINES, Baseline
-from plot import Panel, panel_of
-from report import Rounds, Target, percentile
-from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
+from plot import panels_of
+from report import Rounds, Settings, Target, percentile
+from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 
 from gdp.runtime.busy_poll import SPIN_US
 from lab.process import new_run
@@ -41,11 +41,9 @@ P99: Final = "RTT p99, ms"
 CPU: Final = {"sender": "sender CPU, ms", "receiver": "receiver CPU, ms", "between": "CPU between, ms"}
 COLUMNS: Final = (MEDIAN, P99, *CPU.values())
 SMALL, IMAGE = 100, 921_600
-SIZES: Final = (SMALL, IMAGE)
+TIMES: Final = {SMALL: 4, IMAGE: 1}  # of ``count`` messages, by size
 MTUS: Final = (1_500, 9_000)
 OURS: Final = tuple(name for name in BASELINES if name.startswith("gdp"))
-_SMALL_TIMES: Final = 4  # so many times as many messages of up to 100 kB are sent
-_LARGE_BYTES: Final = 100_000
 _SECURED: Final = "zenoh-mtls"
 _UNSECURED: Final = "cyclone"
 _RATIOS: Final = {  # bytes, MTU, whether the cores are half taken: at most
@@ -68,16 +66,10 @@ def case_of(size: int, mtu: int, *, loaded: bool) -> str:
     return f"{size:,} B, MTU {mtu}{', cores half taken' if loaded else ''}"
 
 
-def count_of(size: int, options: Options) -> int:
-    """Return how many messages of a size are measured in a round."""
-    count = int(options.count)
-    return count if size > _LARGE_BYTES else _SMALL_TIMES * count
-
-
 def measure_one(baseline: Baseline, chain: Chain, size: int, count: int, loaded: bool, _: int) -> Mapping[str, float]:
     """Return the figures of one baseline in one case, by column."""
     with load_of(loaded=loaded):
-        found = baseline.measure(chain, size, count)
+        found = baseline(chain, size=size, count=count)
     times_s: Sequence[float] = found["rtt_s"]
     figures = {MEDIAN: 1e3 * percentile(times_s, 0.5), P99: 1e3 * percentile(times_s, 0.99)}
     return figures | {CPU[place]: 1e3 * float(cpu_s) for place, cpu_s in found["cpu_s"].items()}
@@ -103,24 +95,11 @@ def targets_of(over: Rounds, ours: Iterable[str], cases: Sequence[Case]) -> list
     return targets
 
 
-def panels_of(over: Rounds, names: Sequence[str]) -> list[Panel]:
-    """Return a panel for each case: medians, whiskers to the p99."""
-    return [panel_of(over, case, MEDIAN, names, p99=P99, ours=OURS) for case in over.cases()]
-
-
-def positive(text: str) -> int:
-    """Return a whole number above 0. Raises ``ValueError``: it is not."""
-    number = int(text)
-    if number < 1:
-        raise ValueError(text)
-    return number
-
-
 def measure(options: Options) -> Outcome:
     """Measure every baseline in every case, round by round."""
     names = options.only or list(BASELINES)
     recorder = Recorder()
-    cases: list[Case] = list(product(SIZES, options.mtu or MTUS, LOADS[options.load]))
+    cases: list[Case] = list(product(TIMES, options.mtu or MTUS, LOADS[options.load]))
     with ExitStack() as stack:
         chains = {mtu: Chain(mtu, stack.enter_context(new_run())) for mtu in dict.fromkeys(mtu for _, mtu, _ in cases)}
         trials = [
@@ -128,15 +107,14 @@ def measure(options: Options) -> Outcome:
                 case_of(size, mtu, loaded=loaded),
                 name,
                 COLUMNS,
-                partial(measure_one, BASELINES[name], chains[mtu], size, count_of(size, options), loaded),
+                partial(measure_one, BASELINES[name], chains[mtu], size, TIMES[size] * options.count, loaded),
             )
             for (size, mtu, loaded), name in product(cases, names)
         ]
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
-    settings = {
-        "rounds": options.rounds,
-        "messages a round": [count_of(size, options) for size in SIZES],
+    settings: Settings = {
+        "messages a round": [times * options.count for times in TIMES.values()],
         "answer, B": ANSWER.size,
         "ends of gdp spin, us": SPIN_US,
         "shared memory": "off everywhere",
@@ -151,31 +129,20 @@ def measure(options: Options) -> Outcome:
         over,
         targets_of(over, ours, cases),
         settings,
-        lambda: panels_of(over, names),
-        is_whole=is_whole(options),
+        panels_of(over, MEDIAN, names, p99=P99, ours=OURS),
     )
 
 
 def is_whole(options: Options) -> bool:
     """Return whether all cases are measured, so that the figures are written to ``docs/benchmarks``."""
-    return not (options.quick or options.only or options.mtu) and options.load == "both"
+    return not (options.only or options.mtu) and options.load == "both"
 
 
-def main() -> None:
-    """Run the bench, or a part of it."""
-    parser = command_line(__doc__, quick={"rounds": 1, "count": 10}, has_record=True, has_plot=True)
-    parser.add_argument("--rounds", type=positive, default=5)
-    text = "messages above 100 kB; of smaller ones four times that"
-    parser.add_argument("--count", type=positive, default=80, help=text)
+if __name__ == "__main__":
+    parser = command_line(__doc__, rounds=5, quick={"rounds": 1, "count": 10}, has_record=True, has_plot=True)
+    parser.set_defaults(count=80, is_whole=is_whole)
     parser.add_argument("--only", action="append", choices=list(BASELINES), help="this baseline; may be repeated")
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     text = "none, or processes that take half of each core, or each in turn (default: %(default)s)"
     parser.add_argument("--load", choices=tuple(LOADS), default="both", help=text)
-    options = parse(parser)
-    options.no_plot |= not is_whole(options)
-    options.is_whole = is_whole
-    perform(options, measure)
-
-
-if __name__ == "__main__":
-    main()
+    run_bench(parser, measure)

@@ -15,7 +15,6 @@ four read, who wait for the slowest or have a pace of their own.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -28,7 +27,7 @@ from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link.conditions import FRAME_BYTES, Conditions
 from thin_link.line import open_line
 from thin_link.score import AGE_P50, AGE_P99
-from thin_link.systems import start_role
+from thin_link.systems import run_window, started
 from thin_link.traffic import CAMERA_BYTES, OWN_PACE, TOGETHER, streams, wire_bytes
 
 from gdp.host.run_registry import Run
@@ -41,6 +40,7 @@ from lab.topology import flat_topology
 ROBOT, EDGE, HUB = "robot", "s0", "s1"
 LINKS: Final = {"fast": ("100", "0"), "medium": ("5", "0"), "thin": ("1", "0"), "lossy": ("100", "burst")}
 RTT_MS: Final = 20.0
+SEED: Final = 1  # of the losses
 ALONE: Final = "alone"
 IMAGES_S, OF_LINK = "images/s", "of the link"
 COLUMNS: Final = (IMAGES_S, OF_LINK, AGE_P50, AGE_P99)
@@ -48,8 +48,6 @@ _SHARE: Final = 0.9
 _OF_ALONE: Final = 0.95
 _AGE_MS: Final = 300.0
 _SETTLE_S: Final = 6.0
-_DRAIN_S: Final = 2.5
-_READY_S: Final = 45.0
 
 
 def line_of(reader: str) -> str:
@@ -75,39 +73,32 @@ def machines(run: Run) -> Lab:
     return lab
 
 
-def links_of(seed: int) -> dict[str, Conditions]:
-    """Return the links by reader; bursts are counted in frames, so the few frames of reports have no such losses."""
-    links = {each: Conditions.of(rate, RTT_MS, loss, "second", seed=seed) for each, (rate, loss) in LINKS.items()}
-    return {each: replace(link, down=replace(link.down, loss=0.0)) for each, link in links.items()}
+def link_of(reader: str) -> Conditions:
+    """Return the link of a reader; bursts are counted in frames, so the few frames of reports have no such losses."""
+    rate, loss = LINKS[reader]
+    link = Conditions.of(rate, RTT_MS, loss, "second", seed=SEED)
+    return replace(link, down=replace(link.down, loss=0.0))
 
 
 def exchange(lab: Lab, readers: Sequence[str], pace: str, options: Options, over: Rounds) -> None:
     """Publish to these readers for a while; add the figures of each."""
-    (images,), links = streams(pace), links_of(options.seed)
+    (images,) = streams(pace)
     with ExitStack() as stack:
-        ends = {each: (HUB, switch_of(each)) for each in readers}
-        lines = [stack.enter_context(open_line(lab, links[each], line_of(each), ends[each])) for each in readers]
+        lines = [
+            stack.enter_context(open_line(lab, link_of(each), line_of(each), (HUB, switch_of(each))))
+            for each in readers
+        ]
         nodes = stack.enter_context(BenchNodes(lab, (HUB, EDGE, *map(switch_of, readers)), plane="kernel"))
-        rights = {each: {Right.READ: [images.name]} for each in readers} | {ROBOT: {Right.PUBLISH: [images.name]}}
-        started = {}
-        for each, granted in rights.items():
-            own = {"config": str(nodes.admit_member(each, granted)), "readers": len(readers)}
-            settings = {"system": "gdp", "camera": pace, "own": own}
-            role = "robot" if each == ROBOT else "cloud"
-            started[each] = stack.enter_context(start_role(lab, each, role, settings, has_orders=True))
-        for end in started.values():
-            end.read(_READY_S)
-        for line in lines:
-            line.rewind()
-        start_ns = time.monotonic_ns() + 50_000_000
-        begin_ns = start_ns + round(_SETTLE_S * 1e9)
-        end_ns = begin_ns + round(options.seconds * 1e9)
-        for end in started.values():
-            end.tell(start_ns=start_ns, begin_ns=begin_ns, end_ns=end_ns, drained_ns=end_ns + round(_DRAIN_S * 1e9))
-        time.sleep((end_ns - time.monotonic_ns()) / 1e9 + _DRAIN_S)
-        for each in readers:
-            said = started[each].read(_READY_S)["streams"][images.name]
-            for column, figure in figures_of(links[each], said, options.seconds).items():
+        roles = [*((each, "cloud", Right.READ) for each in readers), (ROBOT, "robot", Right.PUBLISH)]
+        own = [
+            (each, role, {"config": str(nodes.admit_member(each, {right: [images.name]})), "readers": len(readers)})
+            for each, role, right in roles
+        ]
+        ends = stack.enter_context(started(lab, "gdp", pace, own))
+        _, said = run_window(lines, ends, options.seconds, _SETTLE_S)
+        for each, reported in zip(readers, said, strict=False):
+            figures = figures_of(link_of(each), reported["streams"][images.name], options.seconds)
+            for column, figure in figures.items():
                 over.add(pace if len(readers) > 1 else ALONE, each, column, figure)
 
 
@@ -124,24 +115,24 @@ def measure(options: Options) -> Outcome:
     recorder = Recorder()
     over = recorder.rounds
 
-    def ran(readers: Sequence[str], pace: str) -> dict[str, float]:
+    def ran(readers: Sequence[str], pace: str, _: int) -> dict[str, float]:
         with new_run() as run:
             exchange(machines(run), readers, pace, options, over)
         return {}
 
     trials = [
-        Trial("fast", ALONE, (), lambda _: ran(["fast"], OWN_PACE)),
-        *(Trial("all readers", pace, (), lambda _, pace=pace: ran([*LINKS], pace)) for pace in (TOGETHER, OWN_PACE)),  # type: ignore[misc]
+        Trial("fast", ALONE, (), partial(ran, ["fast"], OWN_PACE)),
+        *(Trial("all readers", pace, (), partial(ran, [*LINKS], pace)) for pace in (TOGETHER, OWN_PACE)),
     ]
     recorder.interleave(trials, options.rounds)
     ratio = partial(over.ratio, one=OWN_PACE, other=ALONE, case="fast", column=IMAGES_S, asked=_OF_ALONE)
     targets = [ratio("fast, images/s: own-pace / alone")]
-    for each, link in links_of(options.seed).items():
+    for each in LINKS:
         if each in ("medium", "thin"):
             targets.append(over.target(f"{each}, {OF_LINK}", OWN_PACE, each, OF_LINK, _SHARE))
-        asked = _AGE_MS + wire_bytes(CAMERA_BYTES["jpeg"]) * 8e3 / link.up.bits_s
+        asked = _AGE_MS + wire_bytes(CAMERA_BYTES["jpeg"]) * 8e3 / link_of(each).up.bits_s
         targets.append(over.target(f"{each}, {AGE_P99}", OWN_PACE, each, AGE_P99, asked, at_most=True))
-    settings = {"rounds": options.rounds, "seconds of each figure": options.seconds, "seed": options.seed}
+    settings = {"seconds of each figure": options.seconds, "seed": SEED}
     return Outcome(
         "own_pace",
         "One encoder, readers behind links of 100, 5 and 1 Mbit/s and a lossy one",
@@ -153,5 +144,4 @@ def measure(options: Options) -> Outcome:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=3, seconds=15.0, quick={"rounds": 1, "seconds": 5.0}, has_record=True)
-    parser.add_argument("--seed", type=int, default=1, help="of the losses (default: %(default)s)")
     run_bench(parser, measure)

@@ -3,14 +3,11 @@
 I/O. One file. Needs matplotlib, the extra ``bench`` of this package, and no display.
 
     require_plot()                                       # at the start, so that a missing library is reported first
+    panels_of(over, column, contenders)                  # a panel for each case; whiskers: lowest to highest round
+    panels_of(over, median_column, contenders, p99=p99_column)        # whiskers: median to p99
     save_bars(path, "Forwarding", str(state), [
         Panel("1400 B, 3 switches", "frames/s", [Bar("kernel", 450e3, 440e3, 460e3), Bar("bridge", 244e3)]),
-        Panel("100 B", "round trip, µs: median, whisker to p99", [Bar("kernel", 4.7, None, 12.0)], log=True),
     ])
-    panel_of(over, case, column, contenders)             # whiskers: lowest to highest round
-    panel_of(over, case, median_column, contenders, p99=p99_column)   # whiskers: median to p99
-
-Several bars of one baseline (sizes, encodings) are bars with a label each, in one panel or in panels side by side.
 """
 
 from __future__ import annotations
@@ -20,8 +17,12 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from report import Rounds, number_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _COLOURS = ("#1f6f8b", "#99a8b2")  # ours, the others
 _BAR_INCHES, _PANEL_INCHES, _WIDTH_INCHES, _PER_ROW = 0.3, 1.1, 6.0, 2
@@ -38,6 +39,12 @@ class Bar:
     high: float | None = None
     ours: bool = True
 
+    @property
+    def whisker(self) -> tuple[float, float]:
+        """Return how far the whisker reaches below and above the median."""
+        low, high = (self.median if end is None else end for end in (self.low, self.high))
+        return self.median - low, high - self.median
+
 
 @dataclass(frozen=True, slots=True)
 class Panel:
@@ -46,34 +53,28 @@ class Panel:
     title: str
     unit: str
     bars: Sequence[Bar]
-    log: bool = False
 
 
-def panel_of(
-    over: Rounds,
-    case: str,
-    column: str,
-    contenders: Sequence[str],
-    *,
-    title: str | None = None,
-    p99: str | None = None,
-    ours: Sequence[str] = (),
-    log: bool = False,
-) -> Panel:
-    """Return the panel of one column of one case; baselines without a figure are left out.
+def panels_of(
+    over: Rounds, column: str, contenders: Sequence[str], *, p99: str | None = None, ours: Sequence[str] | None = None
+) -> list[Panel]:
+    """Return a panel of one column for each case that has it; baselines without a figure are left out.
 
-    ``p99``: the column that whiskers lead to; without it they span the rounds. ``ours``: baselines to colour as ours.
+    ``p99``: the column that whiskers lead to; without it they span the rounds. ``ours``: baselines to colour as ours;
+    None: all of them.
     """
-    bars = []
-    for contender in contenders:
-        spread = over.spread(contender, case, column)
-        if spread is None:
-            continue
-        tail = over.spread(contender, case, p99) if p99 else None
-        low, high = (None, tail.median if tail else None) if p99 else (spread.low, spread.high)
-        bars.append(Bar(contender, spread.median, low, high, contender in ours))
-    whiskers = "whiskers: to the p99" if p99 else "whiskers: lowest and highest round"
-    return Panel(title or case, f"{column}; {whiskers}", bars, log)
+    unit = f"{column}; whiskers: {'to the p99' if p99 else 'lowest and highest round'}"
+    panels = []
+    for case in over.cases():
+        bars = []
+        for who in contenders:
+            if spread := over.spread(who, case, column):
+                tail = over.spread(who, case, p99) if p99 else None
+                low, high = (None, tail.median if tail else None) if p99 else (spread.low, spread.high)
+                bars.append(Bar(who, spread.median, low, high, ours is None or who in ours))
+        if bars:
+            panels.append(Panel(case, unit, bars))
+    return panels
 
 
 def require_plot() -> None:
@@ -104,37 +105,32 @@ def save_bars(path: Path, title: str, footer: str, panels: Sequence[Panel]) -> N
         gridspec_kw={"height_ratios": heights},
         layout="constrained",
     )
-    for row, line in zip(rows, axes, strict=True):
-        for at, axis in enumerate(line):
-            if at >= len(row):
-                axis.set_visible(False)
-                continue
-            panel, places = row[at], range(len(row[at].bars))
-            medians = [bar.median for bar in panel.bars]
-            axis.barh(places, medians, 0.66, color=[_COLOURS[not bar.ours] for bar in panel.bars])
-            below = [bar.median - (bar.median if bar.low is None else bar.low) for bar in panel.bars]
-            upstream = [(bar.median if bar.high is None else bar.high) - bar.median for bar in panel.bars]
-            axis.errorbar(medians, places, xerr=[below, upstream], fmt="none", ecolor="#222222", capsize=2.5, lw=0.9)
-            for place, bar in zip(places, panel.bars, strict=True):
-                end = max(bar.median, bar.high or 0.0)
-                axis.annotate(
-                    number_text(bar.median), (end, place), (4, 0), textcoords="offset points", va="center", fontsize=8
-                )
-            if panel.log:
-                axis.set_xscale("log")
-                axis.xaxis.set_minor_formatter("")
-            else:
-                axis.locator_params(axis="x", nbins=5)
-            axis.xaxis.set_major_formatter("{x:,.10g}")
-            axis.margins(x=0.16)
-            axis.set_yticks(places, [bar.label for bar in panel.bars], fontsize=8)
-            axis.invert_yaxis()
-            axis.set_title(panel.title, fontsize=10, loc="left")
-            axis.set_xlabel(panel.unit, fontsize=8)
-            axis.tick_params(axis="x", labelsize=8)
-            axis.spines[["top", "right"]].set_visible(False)
+    for axis in axes.flat[len(drawn) :]:
+        axis.set_visible(False)
+    for axis, panel in zip(axes.flat, drawn, strict=False):
+        _draw(axis, panel)
     figure.suptitle(f"{title}\n", fontsize=12)
     figure.supxlabel(footer, fontsize=7, color="#555555")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=_DOTS_PER_INCH)
     plt.close(figure)
+
+
+def _draw(axis: Axes, panel: Panel) -> None:
+    bars = panel.bars
+    whiskers = list(zip(*(bar.whisker for bar in bars), strict=True))
+    style = {"ecolor": "#222222", "capsize": 2.5, "lw": 0.9}
+    colours = [_COLOURS[not bar.ours] for bar in bars]
+    drawn = axis.barh(
+        range(len(bars)), [bar.median for bar in bars], 0.66, color=colours, xerr=whiskers, error_kw=style
+    )
+    axis.bar_label(drawn, [number_text(bar.median) for bar in bars], padding=4, fontsize=8)
+    axis.set_yticks(range(len(bars)), [bar.label for bar in bars], fontsize=8)
+    axis.locator_params(axis="x", nbins=5)
+    axis.xaxis.set_major_formatter("{x:,.10g}")
+    axis.margins(x=0.16)
+    axis.invert_yaxis()
+    axis.set_title(panel.title, fontsize=10, loc="left")
+    axis.set_xlabel(panel.unit, fontsize=8)
+    axis.tick_params(axis="x", labelsize=8)
+    axis.spines[["top", "right"]].set_visible(False)

@@ -24,7 +24,7 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from plot import Panel, panel_of
+from plot import panels_of
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
@@ -44,12 +44,7 @@ SERVING: Final = "until a replacement serves, s"
 RECONCILED: Final = "until the journal is right, s"
 MOVED: Final = "until another machine is the gateway, s"
 SILENCE: Final = "longest time without an answer, s"
-COLUMNS: Final = {
-    PREEMPTED: (DETECTED, MOVED, SILENCE, SERVING),
-    KILLED: (DETECTED, MOVED, SILENCE, SERVING),
-    FROZEN: (DETECTED, MOVED, SILENCE, SERVING),
-    SUPERVISOR: (RECONCILED, MOVED, SILENCE, SERVING),
-}
+FIGURES: Final = (DETECTED, RECONCILED, MOVED, SILENCE, SERVING)
 TRAFFIC, FAILED = "requests meanwhile", "failed"
 ASKED_S: Final = {(PREEMPTED, SERVING): 5.0, (KILLED, DETECTED): 1.0, (SUPERVISOR, RECONCILED): 2.0}
 NOTICE_S: Final = 8.0
@@ -92,23 +87,13 @@ def measure_case(cluster: Cluster, case: str) -> dict[str, float | None]:
 
 def targets_of(over: Rounds) -> list[Target]:
     """Return the targets of the measured cases."""
-    found = []
-    for case, columns in COLUMNS.items():
-        for column in columns:
-            if over.spread(WHO, CASES[case], column) is not None:
-                asked_s = ASKED_S.get((case, column))
-                found.append(over.target(f"{CASES[case]}: {column}", WHO, CASES[case], column, asked_s, at_most=True))
-    return [*found, over.target(f"{TRAFFIC}: {FAILED}", WHO, TRAFFIC, FAILED, 0.0, at_most=True)]
-
-
-def panels_of(over: Rounds) -> list[Panel]:
-    """Return a panel for each figure: medians over the rounds."""
-    return [
-        panel_of(over, CASES[case], column, [WHO], title=f"{CASES[case]}: {column}")
-        for case, columns in COLUMNS.items()
-        for column in columns
-        if over.spread(WHO, CASES[case], column) is not None
+    found = [
+        over.target(f"{what}: {column}", WHO, what, column, ASKED_S.get((case, column)), at_most=True)
+        for case, what in CASES.items()
+        for column in FIGURES
+        if over.spread(WHO, what, column)
     ]
+    return [*found, over.target(f"{TRAFFIC}: {FAILED}", WHO, TRAFFIC, FAILED, 0.0, at_most=True)]
 
 
 def measure(options: Options) -> Outcome:
@@ -136,13 +121,12 @@ def measure(options: Options) -> Outcome:
         over,
         targets_of(over),
         {
-            "rounds": options.rounds,
             "machines": machines,
             "gateway": options.gateway,
             "requests a second": RATE,
             "notice, s": NOTICE_S,
         },
-        lambda: panels_of(over),
+        [panel for column in FIGURES for panel in panels_of(over, column, [WHO])],
     )
 
 

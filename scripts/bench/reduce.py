@@ -19,7 +19,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from machine import DATA, RefusedError, data_folder
-from plot import Panel, panel_of
 from report import Rounds, Target, progress
 from rosbags.typesys import Stores, get_typestore
 from skeleton import Options, Outcome, command_line, run_bench
@@ -73,15 +72,20 @@ def described(type_name: str) -> Channel:
     return Channel("/a", type_name, 2, definition=definition, definition_format="msg")
 
 
-def image(encoding: str, pixels: npt.NDArray[Any]) -> bytes:
-    """Return the message of an image, [height, width] or [height, width, channels]."""
-    types, (height, width) = STORE.types, pixels.shape[:2]
+def serialised(type_name: str, **fields: Any) -> bytes:
+    """Return a message with a header, in CDR."""
+    types = STORE.types
     stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
+    return bytes(STORE.serialize_cdr(types[type_name](header=header, **fields), type_name))
+
+
+def image(encoding: str, pixels: npt.NDArray[Any]) -> bytes:
+    """Return the message of an image, [height, width] or [height, width, channels]."""
+    height, width = pixels.shape[:2]
     data = np.ascontiguousarray(pixels).view(np.uint8).ravel()
     fields = {"height": height, "width": width, "encoding": encoding, "step": data.size // height}
-    message = types[IMAGE](header=header, is_bigendian=0, data=data, **fields)
-    return bytes(STORE.serialize_cdr(message, IMAGE))
+    return serialised(IMAGE, is_bigendian=0, data=data, **fields)
 
 
 def frames(pattern: str) -> list[npt.NDArray[Any]]:
@@ -96,7 +100,7 @@ def frames(pattern: str) -> list[npt.NDArray[Any]]:
 def recorded(path: Path, topic_type: str) -> tuple[Channel, list[bytes]] | None:
     """Return the first messages of a type; None where the recording is missing, which is reported."""
     if not path.exists():
-        progress(f"left out: {topic_type}, for there is no {path} (see --bags)")
+        progress(f"left out: {topic_type}, for there is no {path}")
         return None
     found: list[bytes] = []
     channel: Channel | None = None
@@ -128,26 +132,32 @@ def cases(bags: Path) -> list[Case]:
             ("16UC1", depth, png | compressed),
         )
     ]
-    optional = [
-        _of_bag(bags / "tilt_laser.bag", "sensor_msgs/msg/LaserScan", "scan of 1,078 beams"),
-        _of_bag(bags / "ros_numpy_test.bag", "nav_msgs/msg/OccupancyGrid", "map"),
-        _short(bags / "tilt_laser.bag", "sensor_msgs/msg/Imu"),
-        _short(bags / "rosbag2_test", "geometry_msgs/msg/PoseStamped"),
-    ]
-    return [*found, _points(depth), *(each for each in optional if each is not None)]
+    found.append(_points(depth))
+    for bag, type_name, what in (
+        ("tilt_laser.bag", "sensor_msgs/msg/LaserScan", "scan of 1,078 beams"),
+        ("ros_numpy_test.bag", "nav_msgs/msg/OccupancyGrid", "map"),
+        ("tilt_laser.bag", "sensor_msgs/msg/Imu", ""),
+        ("rosbag2_test", "geometry_msgs/msg/PoseStamped", ""),
+    ):
+        if taken := recorded(bags / bag, type_name):
+            channel, messages = taken
+            tried: Mapping[str, Settings] = compressed
+            if not what:  # short ones: half of them train a dictionary
+                half_way = len(messages) // 2
+                dictionary: bytes = zstd.train_dict(messages[:half_way], 4_096).dict_content
+                tried = {"zstd 3": zstd_of(3), "zstd 3, dictionary of 4 KiB": zstd_of(3, dictionary)}
+                messages = messages[half_way:]
+            found.append(Case(f"{what or type_name}, recorded", channel, messages, tried))
+    return found
 
 
 def cloud(points: npt.NDArray[np.float32]) -> bytes:
     """Return the message of a point cloud, float32 [points, 4]: x, y, z, intensity."""
-    types, count = STORE.types, len(points)
-    stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
-    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
-    field = types["sensor_msgs/msg/PointField"]
+    count, field = len(points), STORE.types["sensor_msgs/msg/PointField"]
     named = [field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate(("x", "y", "z", "i"))]
     data = np.ascontiguousarray(points, np.float32).view(np.uint8).ravel()
     sizes = {"height": 1, "width": count, "point_step": 16, "row_step": 16 * count}
-    message = types[CLOUD](header=header, fields=named, is_bigendian=False, data=data, is_dense=True, **sizes)
-    return bytes(STORE.serialize_cdr(message, CLOUD))
+    return serialised(CLOUD, fields=named, is_bigendian=False, data=data, is_dense=True, **sizes)
 
 
 def _points(depths: Sequence[npt.NDArray[np.uint16]]) -> Case:
@@ -164,24 +174,6 @@ def _points(depths: Sequence[npt.NDArray[np.uint16]]) -> Case:
     half: dict[str, Settings] = {"region, half of the width": {"region": Region(x=(0, 100))}}
     tried = thinned | half | {f"zstd {level}": zstd_of(level) for level in LEVELS} | both
     return Case("point cloud of depth 320x240, recorded", described(CLOUD), messages, tried)
-
-
-def _of_bag(bag: Path, type_name: str, what: str) -> Case | None:
-    found = recorded(bag, type_name)
-    if found is None:
-        return None
-    return Case(f"{what}, recorded", *found, {f"zstd {level}": zstd_of(level) for level in LEVELS})
-
-
-def _short(bag: Path, type_name: str) -> Case | None:
-    found = recorded(bag, type_name)
-    if found is None:
-        return None
-    channel, messages = found
-    half = len(messages) // 2
-    dictionary: bytes = zstd.train_dict(messages[:half], 4_096).dict_content
-    reductions = {"zstd 3": zstd_of(3), "zstd 3, dictionary of 4 KiB": zstd_of(3, dictionary)}
-    return Case(f"{type_name}, recorded", channel, messages[half:], reductions)
 
 
 def measure_one(case: Case, settings: Settings, passes: int) -> dict[str, float]:
@@ -232,16 +224,12 @@ def measure(options: Options) -> Outcome:
         for name in case.reductions:
             what = f"{case.name}: {name} / {PLAIN}, bytes"
             targets.append(over.ratio(what, name, PLAIN, case.name, "bytes", None))
-    settings = {"rounds": options.rounds, "messages of a figure": options.passes * MESSAGES or "each once"}
+    settings = {"messages of a figure": options.passes * MESSAGES or "each once"}
     title = "Bytes and CPU time of reduced messages"
-    return Outcome("reduce", title, over, targets, settings, lambda: _panels(over, every))
-
-
-def _panels(over: Rounds, every: Sequence[Case]) -> list[Panel]:
-    return [panel_of(over, case.name, "bytes", [PLAIN, *case.reductions]) for case in (*every[:1], *every[3:5])]
+    return Outcome("reduce", title, over, targets, settings)
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 0}, has_record=True, has_plot=True)
+    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 0}, has_record=True)
     parser.set_defaults(passes=2)  # messages of a figure, in 60; 0: each once
     run_bench(parser, measure)

@@ -21,8 +21,9 @@ import random
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -32,7 +33,7 @@ sys.path.append(str(_HERE.parent / "experiments"))
 from asking import Asking  # noqa: E402 - it lies with the experiments
 from experiment import field_of, work_of  # noqa: E402
 from field import READY_S, Field, Served, Server  # noqa: E402
-from plot import Panel, panel_of  # noqa: E402
+from plot import panels_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
 from samples import Sample, Series  # noqa: E402
 from skeleton import Options, Outcome, command_line, run_bench  # noqa: E402
@@ -73,59 +74,19 @@ _RESTFUL: Final = 80.0  # calls a second
 _BRISK: Final = 200.0
 _BUDGET: Final = 0.02
 _SLOW: Final = {"slow_in": 100, "slow_s": 0.2, "threads": 8}
+Figures = Mapping[str, Mapping[str, float | None]]  # by row and column
 
 
-class Kills:
-    """Kills of all replicas but one at random moments, and their restart; then another one stays. A context manager.
+@contextmanager
+def kills(here: Field, draw: random.Random) -> Iterator[list[float]]:
+    """Kill all replicas but one at random moments, and start them again; then another one stays. Yield the deaths."""
+    servers, over, deaths_s = list(here.servers.values()), threading.Event(), list[float]()
 
-    ``count``: deaths.
-    """
-
-    def __init__(self, here: Field, draw: random.Random) -> None:
-        self.count = 0
-        self._servers = list(here.servers.values())
-        self._draw = draw
-        self._over = threading.Event()
-        self._error: FailedError | None = None
-        self._thread = threading.Thread(target=self._run, name="kills")
-
-    def __enter__(self) -> Kills:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-
-    def _run(self) -> None:
-        try:
-            self._all_serve(self._servers)
-            while not self._over.wait(_REST_S):
-                self._turn()
-        except FailedError as error:
-            self._error = error
-
-    def _turn(self) -> None:
-        stays = self._draw.choice(self._servers)
-        others = self._draw.sample([each for each in self._servers if each is not stays], len(self._servers) - 1)
-        for server in others:
-            self._over.wait(self._draw.uniform(0, _APART_S))
-            server.kill()
-            self.count += 1
-        for server in others:
-            self._over.wait(self._draw.uniform(0, _AWAY_S))
-            server.begin()
-        for server in others:
-            server.wait()
-        self._all_serve(others)
-
-    def _all_serve(self, servers: Sequence[Server]) -> None:
+    def all_serve(servers: Sequence[Server]) -> None:
         """Wait until each node reports a request, or until no more are sent."""
         for server in servers:
             late_s = time.monotonic() + READY_S
-            while not self._over.is_set():
+            while not over.is_set():
                 try:
                     server.hear(_STEP_S)
                     break
@@ -133,59 +94,81 @@ class Kills:
                     if time.monotonic() > late_s:
                         raise
 
+    def run() -> None:
+        """Work until the block ends."""
+        all_serve(servers)
+        while not over.wait(_REST_S):
+            stays = draw.choice(servers)
+            others = draw.sample([each for each in servers if each is not stays], len(servers) - 1)
+            for server in others:
+                over.wait(draw.uniform(0, _APART_S))
+                server.kill()
+                deaths_s.append(time.monotonic())
+            for server in others:
+                over.wait(draw.uniform(0, _AWAY_S))
+                server.begin()
+            for server in others:
+                server.wait()
+            all_serve(others)
 
-class Bench:
-    """Rounds in progress. ``over``: the figures."""
+    with ThreadPoolExecutor(1) as pool:
+        killing = pool.submit(run)
+        try:
+            yield deaths_s
+        finally:
+            over.set()
+        killing.result()
 
-    def __init__(self, rate: float, draw: random.Random) -> None:
-        self._rate = rate
-        self._draw = draw
-        self.over = Rounds()
 
-    def killed(self, count: int) -> None:
-        """Call three replicas while two of them are killed repeatedly."""
-        served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
-        with _field(served) as here, Kills(here, self._draw) as kills:
-            found, asking = _ask(here, ["/number"], count, lanes=_LANES, rate=self._rate, counts_answers=True)
-        samples = found["/number"]
-        figures: dict[str, float | None] = {
-            FAILED: sum(not each.machine for each in samples),
-            WRONG: sum(bool(each.machine) and not each.is_right for each in samples),
-            "answers": asking.heard,
-            TWICE: asking.twice,
-        }
-        figures |= {COUNT: count, KILLS: kills.count, **_latencies(samples)}
-        self._add(KILLED, THREE, figures)
+def killed(count: int, options: Options, draw: random.Random) -> Figures:
+    """Call three replicas while two of them are killed repeatedly."""
+    served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
+    with _field(served) as here, kills(here, draw) as deaths_s:
+        found, asking = _ask(here, ["/number"], count, lanes=_LANES, rate=options.rate, counts_answers=True)
+    samples = found["/number"]
+    figures: dict[str, float | None] = {
+        FAILED: sum(not each.machine for each in samples),
+        WRONG: sum(bool(each.machine) and not each.is_right for each in samples),
+        "answers": asking.heard,
+        TWICE: asking.twice,
+    }
+    return {THREE: {**figures, COUNT: count, KILLS: len(deaths_s), **_latencies(samples)}}
 
-    def added(self, count: int) -> None:
-        """Call one server and two replicas in turn; all are idle between two calls."""
-        names = {ONE: "/one", TWO: "/two"}
-        with _field([Served("/one", TYPE, _MACHINES[:1]), Served("/two", TYPE, _MACHINES[:2])]) as here:
-            found, _ = _ask(here, list(names.values()), count, rate=_RESTFUL)
-        for who, name in names.items():
-            self._add(ADDED, who, _latencies(found[name]))
 
-    def hedged(self, count: int) -> None:
-        """Call a server that is slow sometimes, two of them, and the second one only if the first is late."""
-        names = {ONE: ("/one/m1", "/one/m2"), BOTH: ("/both",), LATE: ("/late",)}
-        served = [
-            Served("/one/m1", TYPE, _MACHINES[:1]),
-            Served("/one/m2", TYPE, _MACHINES[1:2]),
-            Served("/both", TYPE, _MACHINES[:2]),
-            Served("/late", TYPE, _MACHINES[:2], imports={"replication": {"mode": "hedged", "budget": _BUDGET}}),
-        ]
-        turns = ["/one/m1", "/both", "/late", "/one/m2", "/both", "/late"]
-        with _field(served, **_SLOW) as here:
-            found, asking = _ask(here, turns, count, rate=_BRISK)
-        for who, its in names.items():
-            had = sum(_had(found[name]) for name in its)
-            asked = sum(asking.warm_up[name] + len(found[name]) for name in its)
-            samples = [each for name in its for each in found[name]]
-            self._add(HEDGED, who, {**_latencies(samples), EXTRA: 100 * (had / asked - 1)})
+def added(count: int, *_: object) -> Figures:
+    """Call one server and two replicas in turn; all are idle between two calls."""
+    names = {ONE: "/one", TWO: "/two"}
+    with _field([Served("/one", TYPE, _MACHINES[:1]), Served("/two", TYPE, _MACHINES[:2])]) as here:
+        found = _ask(here, list(names.values()), count, rate=_RESTFUL)[0]
+    return {who: _latencies(found[name]) for who, name in names.items()}
 
-    def _add(self, case: str, who: str, figures: Mapping[str, float | None]) -> None:
-        for column, value in figures.items():
-            self.over.add(who, CASES[case], column, value)
+
+def hedged(count: int, *_: object) -> Figures:
+    """Call a server that is slow sometimes, two of them, and the second one only if the first is late."""
+    names = {ONE: ("/one/m1", "/one/m2"), BOTH: ("/both",), LATE: ("/late",)}
+    served = [
+        Served("/one/m1", TYPE, _MACHINES[:1]),
+        Served("/one/m2", TYPE, _MACHINES[1:2]),
+        Served("/both", TYPE, _MACHINES[:2]),
+        Served("/late", TYPE, _MACHINES[:2], imports={"replication": {"mode": "hedged", "budget": _BUDGET}}),
+    ]
+    turns = ["/one/m1", "/both", "/late", "/one/m2", "/both", "/late"]
+    with _field(served, **_SLOW) as here:
+        found, asking = _ask(here, turns, count, rate=_BRISK)
+    figures = {}
+    for who, its in names.items():
+        had = sum(_had(found[name]) for name in its)
+        asked = sum(asking.warm_up[name] + len(found[name]) for name in its)
+        samples = [each for name in its for each in found[name]]
+        figures[who] = {**_latencies(samples), EXTRA: 100 * (had / asked - 1)}
+    return figures
+
+
+PARTS: Final[Mapping[str, Callable[[int, Options, random.Random], Figures]]] = {
+    KILLED: killed,
+    ADDED: added,
+    HEDGED: hedged,
+}
 
 
 def _field(served: Sequence[Served], **settings: object) -> AbstractContextManager[Field]:
@@ -195,54 +178,41 @@ def _field(served: Sequence[Served], **settings: object) -> AbstractContextManag
 
 def targets_of(over: Rounds) -> list[Target]:
     """Return the targets of the measured cases."""
-    killed, added, hedged = CASES.values()
-    targets = []
-    if killed in over.cases():
-        for column in (FAILED, WRONG, TWICE):
-            targets.append(over.target(f"{killed}: {column}", THREE, killed, column, 0.0, at_most=True))
-    if added in over.cases():
-        targets.append(over.difference(f"{added}: {TWO} - {ONE}, ms", TWO, ONE, added, MEDIAN, ADDED_MS))
-    if hedged in over.cases():
-        targets.append(over.target(f"{hedged}: {LATE}, {EXTRA}", LATE, hedged, EXTRA, 100 * _BUDGET, at_most=True))
-        for who, asked in ((LATE, GAIN), (BOTH, None)):
-            targets.append(over.ratio(f"{hedged}: {ONE} / {who}, p99.9", ONE, who, hedged, P999, asked))
-    return targets
-
-
-def panels_of(over: Rounds) -> list[Panel]:
-    """Return a panel for each case: medians, whiskers to the p99."""
-    rows = {ADDED: (ONE, TWO), HEDGED: (ONE, BOTH, LATE), KILLED: (THREE,)}
-    return [
-        panel_of(over, CASES[case], MEDIAN, list(who), p99=P99, ours=list(who))
-        for case, who in rows.items()
-        if CASES[case] in over.cases()
+    kill, add, hedge = CASES.values()
+    targets = [over.target(f"{kill}: {each}", THREE, kill, each, 0.0, at_most=True) for each in (FAILED, WRONG, TWICE)]
+    targets += [
+        over.difference(f"{add}: {TWO} - {ONE}, ms", TWO, ONE, add, MEDIAN, ADDED_MS),
+        over.target(f"{hedge}: {LATE}, {EXTRA}", LATE, hedge, EXTRA, 100 * _BUDGET, at_most=True),
+        over.ratio(f"{hedge}: {ONE} / {LATE}, p99.9", ONE, LATE, hedge, P999, GAIN),
+        over.ratio(f"{hedge}: {ONE} / {BOTH}, p99.9", ONE, BOTH, hedge, P999, None),
     ]
+    return [each for each in targets if each.what.partition(": ")[0] in over.cases()]
 
 
 def measure(options: Options) -> Outcome:
     """Measure the parts in turn, round by round."""
-    bench = Bench(options.rate, random.Random(SEED))
-    parts = {KILLED: bench.killed, ADDED: bench.added, HEDGED: bench.hedged}
-    only = options.only or list(parts)
+    over, draw, only = Rounds(), random.Random(SEED), options.only or list(PARTS)
     counts = {each: options.requests or (QUICK if options.quick else REQUESTS)[each] for each in only}
     rounds = {each: 1 if options.quick else options.rounds or ROUNDS[each] for each in only}
     for at in range(1, max(rounds.values()) + 1):
         for each in only:
             if at <= rounds[each]:
                 progress(f"round {at}/{rounds[each]}, {each}: {counts[each]} requests")
-                parts[each](counts[each])
+                for who, figures in PARTS[each](counts[each], options, draw).items():
+                    for column, value in figures.items():
+                        over.add(who, CASES[each], column, value)
     return Outcome(
         "replicas",
         "Calls of a service with replicas, over two switches",
-        bench.over,
-        targets_of(bench.over),
+        over,
+        targets_of(over),
         {
             "rounds": _reported(rounds),
             "requests of a round": _reported(counts),
             "requests a second while killed": options.rate,
             "seed": SEED,
         },
-        lambda: panels_of(bench.over),
+        panels_of(over, MEDIAN, (ONE, TWO, BOTH, LATE, THREE), p99=P99),
     )
 
 

@@ -63,7 +63,7 @@ def measure(options: Options) -> Outcome:
     ]
     for column in (LOST, DOUBLED):
         targets.append(over.target(f"messages {column}", "through tunnels", "whole run", column, 0.0, at_most=True))
-    settings = {"rounds": options.rounds, "messages": len(flow.sent_s)}
+    settings = {"messages": len(flow.sent_s)}
     return Outcome("roaming", "Silence when a robot's address changes", over, targets, settings)
 
 

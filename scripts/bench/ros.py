@@ -26,16 +26,15 @@ round ``image`` and ``small`` run for a minute.
 from __future__ import annotations
 
 import json
-import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from plot import Panel, panel_of
+from plot import panels_of
 from report import Rounds, Target
 from ros_row import READY_S, Row
 from ros_trace import read_calls, steps_of
@@ -43,7 +42,7 @@ from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, per
 
 from lab.credentials import Carried
 from lab.dds import BUFFER_BYTES
-from lab.process import FailedError, new_run
+from lab.process import FailedError, LabProcess, new_run
 from lab.topology import LEFT, RIGHT
 
 DIRECT, OVERLAY, SESSION = "direct", "overlay, cdr", "overlay, cdr, session"
@@ -100,6 +99,20 @@ def kinds_of(options: Options, mtu: int) -> tuple[str, ...]:
     return tuple(STREAMS) if mtu == options.mtu[0] else ("image",)
 
 
+@contextmanager
+def talking(
+    row: Row, program: Sequence[str], settings: Mapping[str, object], *, direct: bool
+) -> Iterator[tuple[LabProcess, LabProcess]]:
+    """Start a listener at B and a talker at A; yield both when every topic is received."""
+    words = [json.dumps(settings)]
+    with (
+        row.process(RIGHT, "listen", [*program, "listen", *words], direct=direct) as listener,
+        row.process(LEFT, "talk", [*program, "talk", *words], direct=direct) as talker,
+    ):
+        listener.read(READY_S)
+        yield listener, talker
+
+
 def measure_stream(row: Row, kind: str, who: str, options: Options, number: int) -> dict[str, float]:
     """Return the figures of one stream in a round, by column. Raises ``FailedError``: nothing was received."""
     stream, is_direct = STREAMS[kind], who == DIRECT
@@ -107,13 +120,9 @@ def measure_stream(row: Row, kind: str, who: str, options: Options, number: int)
     seconds = max(options.seconds, LONG_S) if is_long else options.seconds
     count = round(seconds / stream.every_s)
     settings = {"kind": kind, "topics": stream.topics, "count": count, "every_s": stream.every_s}
-    with (
-        row.node(RIGHT, "ros_topics", "listen", direct=is_direct, **settings) as listener,
-        row.node(LEFT, "ros_topics", "talk", direct=is_direct, **settings) as talker,
-    ):
-        listener.read(READY_S)
+    with talking(row, ("-m", "ros_topics"), settings, direct=is_direct) as (listener, talker):
         cpu_s = row.proxies_cpu_s()
-        os.kill(talker.pid, signal.SIGUSR1)
+        talker.send(signal.SIGUSR1)
         said = listener.read(seconds + _DONE_S)
         used = (row.proxies_cpu_s() - cpu_s) / seconds
     return _figures(said, used) | {LOST: said["lost"], "twice": said["twice"]}
@@ -138,30 +147,23 @@ def measure_trace(options: Options) -> Outcome:
     """Measure the steps of images on their way over both proxies, and directly."""
     stream, over = STREAMS["image"], Rounds()
     count = round(options.seconds / stream.every_s)
-    settings = json.dumps({"kind": "image", "topics": stream.topics, "count": count, "every_s": stream.every_s})
+    settings = {"kind": "image", "topics": stream.topics, "count": count, "every_s": stream.every_s}
     for mtu in options.mtu:
         with new_run() as run:
             stem, pids = run.directory / "calls", {}
             program = ("-m", "ros_trace", str(stem))
             with Row(run, CARRIED, mtu=mtu, program=(*program, "proxy")) as row:
                 for who in (DIRECT, OVERLAY):
-                    ends = [(RIGHT, "listen"), (LEFT, "talk")]
-                    with ExitStack() as stack:
-                        nodes = [
-                            row.process(side, role, [*program, role, settings], direct=who == DIRECT)
-                            for side, role in ends
-                        ]
-                        listener, talker = map(stack.enter_context, nodes)
-                        listener.read(READY_S)
-                        os.kill(talker.pid, signal.SIGUSR1)
+                    with talking(row, program, settings, direct=who == DIRECT) as (listener, talker):
+                        talker.send(signal.SIGUSR1)
                         for node in (listener, listener, talker):  # what it received; its calls are written
                             node.read(options.seconds + _DONE_S)
-                        pids[who] = [node.pid for node in nodes]
+                        pids[who] = [listener.pid, talker.pid]
                 pids[OVERLAY] += row.proxies
             for who, each in pids.items():
                 for step, took_ms in steps_of(read_calls(stem, each)).items():
                     over.add(f"{who}: {step}", f"image, MTU {mtu}", MEDIAN, took_ms)
-    return Outcome("ros_trace", "One image over both proxies, step by step", over, [], {}, is_whole=False)
+    return Outcome("ros_trace", "One image over both proxies, step by step", over, [], {})
 
 
 def _figures(said: Mapping[str, float], cores: float) -> dict[str, float]:
@@ -208,12 +210,6 @@ def _call_targets(over: Rounds, _: Options, mtu: int) -> Iterator[Target]:
         yield over.target(f"{load}: {OVERLAY}, {column}", OVERLAY, load, column, 0.0, at_most=True)
 
 
-def panels_of(over: Rounds) -> list[Panel]:
-    """Return a panel for each case: medians, whiskers to the p99."""
-    names: Sequence[str] = (OVERLAY, SESSION, DIRECT)
-    return [panel_of(over, case, MEDIAN, names, p99=P99, ours=names[:2]) for case in over.cases()]
-
-
 def measure(options: Options) -> Outcome:
     """Measure every case, round by round, on a row of its own for each MTU."""
     recorder = Recorder()
@@ -226,13 +222,12 @@ def measure(options: Options) -> Outcome:
     over = recorder.rounds
     name, title = ("services", "Calls of a ROS 2 service") if options.calls else ("ros", "Real ROS 2 nodes")
     settings = {
-        "rounds": options.rounds,
         "seconds": options.seconds,
         "socket buffers, B": min(BUFFER_BYTES, int(_RMEM_MAX.read_text(encoding="ascii"))),
         "trouble": recorder.notes or "none",
     }
-    targets = targets_of(over, options)
-    return Outcome(name, f"{title} over three kernel switches", over, targets, settings, lambda: panels_of(over))
+    panels = panels_of(over, MEDIAN, (OVERLAY, SESSION, DIRECT), p99=P99, ours=(OVERLAY, SESSION))
+    return Outcome(name, f"{title} over three kernel switches", over, targets_of(over, options), settings, panels)
 
 
 def command(words: Sequence[str] | None = None) -> Options:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Final
 
@@ -19,8 +19,7 @@ from rcl_interfaces.srv import ListParameters
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
 from rclpy.task import Future
-from report import percentile
-from ros_endpoint import End, Settings, reliable, run_role
+from ros_endpoint import End, Settings, percentiles, reliable, run_role
 from std_srvs.srv import SetBool
 
 _WARM_UP: Final = 100
@@ -45,10 +44,8 @@ class _Calls:
     """Calls in progress, and their results."""
 
     def __init__(self) -> None:
-        self.sent = 0
-        self.answered = 0
-        self.wrong = 0
-        self.times_s: list[float] = []
+        self.sent = self.wrong = 0
+        self.times_s: list[float] = []  # of those that were answered
 
     def begin(self, client: Client, then: Callable[[], None]) -> None:
         """Call; ``then`` is called when the answer is there."""
@@ -56,37 +53,33 @@ class _Calls:
 
         def take(future: Future[SetBool.Response]) -> None:
             self.times_s.append(time.perf_counter() - begun_s)
-            self.answered += 1
             self.wrong += future.result().success != data
             then()
 
         self.sent += 1
         client.call_async(SetBool.Request(data=data)).add_done_callback(take)
 
+    def in_turn(self, end: End, clients: Iterator[Client]) -> None:
+        """Call by one client after the other, each when the one before has its answer."""
+        client = next(clients, None)
+        if client is None:
+            end.finish()
+        else:
+            self.begin(client, partial(self.in_turn, end, clients))
+
     def report(self) -> None:
         """Print the figures."""
-        figures = {f"p{at}_s": percentile(self.times_s, at / 100) for at in (50, 99) if self.times_s}
-        say(sent=self.sent, lost=self.sent - self.answered, wrong=self.wrong, **figures)
+        say(sent=self.sent, lost=self.sent - len(self.times_s), wrong=self.wrong, **percentiles(self.times_s))
 
 
 def _warm_clients(end: End, settings: Settings, count: int) -> list[Client]:
     """Return clients that have each called more than once."""
     name, profile = settings["service"], reliable(_DEPTH)
     clients = [end.node.create_client(SetBool, name, qos_profile=profile) for _ in range(count)]
-    turns = iter(clients * max(_WARM_UP // count, 2))
-    calls = _Calls()
-
-    def go_on() -> None:
-        client = next(turns, None)
-        if client is None:
-            end.finish()
-        else:
-            calls.begin(client, go_on)
-
     for client in clients:
         if not client.wait_for_service(_PATIENCE_S):
             raise TimeoutError("no server: the overlay did not come up")
-    go_on()
+    _Calls().in_turn(end, iter(clients * max(_WARM_UP // count, 2)))
     end.run()
     say(event="begins")
     return clients
@@ -96,14 +89,7 @@ def call(end: End, settings: Settings) -> None:
     """Call, one after the other, for so many seconds."""
     (client,) = _warm_clients(end, settings, 1)
     calls, until_s = _Calls(), time.monotonic() + settings["seconds"]
-
-    def go_on() -> None:
-        if time.monotonic() < until_s:
-            calls.begin(client, go_on)
-        else:
-            end.finish()
-
-    go_on()
+    calls.in_turn(end, iter(lambda: client if time.monotonic() < until_s else None, None))
     end.run(settings["seconds"] + _PATIENCE_S)  # an answer may not come
     calls.report()
 
@@ -120,7 +106,7 @@ def load(end: End, settings: Settings) -> None:
             calls.begin(clients[calls.sent % len(clients)], finish_if_all)
 
     def finish_if_all() -> None:
-        if calls.answered == count:
+        if len(calls.times_s) == count:
             end.finish()
 
     end.every(_TICK_S, tick)

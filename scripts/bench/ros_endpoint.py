@@ -14,7 +14,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 from typing import Any, Final
 
@@ -25,6 +25,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from rclpy.timer import Timer
+from report import percentile
 
 try:
     from rclpy.experimental import EventsExecutor as BestExecutor
@@ -76,6 +77,11 @@ class End:
 def reliable(depth: int = 10) -> QoSProfile:
     """Return the profile of all topics here: reliable, volatile, with this depth in messages."""
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def percentiles(times_s: Sequence[float]) -> dict[str, float]:
+    """Return the figures of a report: ``p50_s`` and ``p99_s``; none of no times."""
+    return {f"p{at}_s": percentile(times_s, at / 100) for at in (50, 99) if times_s}
 
 
 def run_role(roles: Mapping[str, Callable[[End, Settings], None]]) -> None:

@@ -15,8 +15,7 @@ from functools import partial
 from typing import Final
 
 from peers.jsonl import say
-from report import percentile
-from ros_endpoint import End, Settings, reliable, run_role
+from ros_endpoint import End, Settings, percentiles, reliable, run_role
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
@@ -156,10 +155,7 @@ def listen(end: End, settings: Settings) -> None:
     say(event="hears")
     end.every(1.0, listener.look)
     end.run()
-    figures = {}
-    if listener.latencies_s:
-        figures = {f"p{at}_s": percentile(listener.latencies_s, at / 100) for at in (50, 99)}
-    say(lost=listener.missing, twice=listener.twice, **figures)
+    say(lost=listener.missing, twice=listener.twice, **percentiles(listener.latencies_s))
 
 
 def camera(end: End, settings: Settings) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import random
 import signal
 import time
+from pathlib import Path
 from typing import Final
 
 from faults.overlay import LOOK_S, Overlay
@@ -23,7 +24,7 @@ from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.metadata import Metadata
 from gdp.stores.files import read_public
-from gdp.stores.keyring import NODE_CERTIFICATE, load_owner
+from gdp.stores.keyring import load_owner
 from lab.machine import gdp
 from lab.process import new_run, until
 from lab.topology import make_topology
@@ -61,7 +62,7 @@ def measure(options: Options) -> Outcome:
         progress(f"network {number + 1} of {options.rounds}")
         with new_run() as run, Overlay(run, _plan()) as overlay:
             overlay.start_all()
-            _Closing(overlay).measure(over)
+            _close_flows(overlay, over)
     targets = []
     for what in over.values:
         seconds = [each for each in over.column(what, CASE, SIGNAL) if each is not None]
@@ -70,58 +71,50 @@ def measure(options: Options) -> Outcome:
             over.target(f"{what}: {P99}", what, CASE, P99, TARGET_MS, at_most=True),
             over.target(f"{what}: {OPEN}", what, CASE, OPEN, 0.0, at_most=True),
         ]
-    settings = {"rounds": options.rounds, "messages a second and flow": HZ}
+    settings = {"messages a second and flow": HZ}
     return Outcome("security", "From a revocation to the last message, three tiers", over, targets, settings)
 
 
-class _Closing:
-    """Closes the flows of one network, one after the other."""
+def _close_flows(overlay: Overlay, over: Rounds) -> None:
+    """Close the flows of one network, one after the other.
 
-    def __init__(self, overlay: Overlay) -> None:
-        self._overlay = overlay
-
-    def measure(self, over: Rounds) -> None:
-        """Add the measurements. Raises ``FailedError``: the flows did not come up, or a process ended by itself."""
-        flows, arrivals_ns = self._overlay.plan.flows, self._overlay.books.arrivals_ns
-        until(
-            lambda: len(arrivals_ns) == len(flows),
-            lambda: f"{len(arrivals_ns)} of {len(flows)} flows are read",
-            STEADY_S,
-            lambda: self._overlay.watch(LOOK_S, is_strict=True),
-        )
-        order = list(range(len(flows)))
-        random.Random(1).shuffle(order)
-        for channel in order:
-            what = "delegation" if flows[channel].publisher == "P" else "membership"
-            time.sleep(0.2 + random.random() * 0.5)
-            begun_ns, signalled_ns = self._revoke(channel)
-            self._overlay.watch(AFTER_S, is_strict=True)
-            last_ns = arrivals_ns[channel, "R"][-1]
-            took_ms = max(last_ns - signalled_ns, 0) / 1e6
-            over.add(what, CASE, SIGNAL, took_ms)
-            over.add(what, CASE, COMMAND, (last_ns - begun_ns) / 1e6)
-            over.add(what, CASE, OPEN, float(last_ns > signalled_ns + round((AFTER_S - 0.5) * 1e9)))
-            progress(f"  {flows[channel].topic}: {took_ms:.0f} ms")
-
-    def _revoke(self, channel: int) -> tuple[int, int]:
-        """Revoke by the command, and hand the file in; return when each began, in monotonic nanoseconds."""
-        flow, folder = self._overlay.plan.flows[channel], self._overlay.directory
-        node = folder / "nodes" / f"proxy-{flow.publisher}"
-        out = folder / "revocations" / f"{channel}.revoke"
-        if flow.publisher == "P":
-            name = load_owner(folder / "owner").subject(Metadata({"kind": "topic", "name": flow.topic})).name
-            file = node / "delegations" / f"{name.to_text()}.delegation"
-            words = ["delegate", "revoke", str(file), "--owner", str(folder / "owner"), "--out", str(out)]
-        else:
-            label = self._overlay.plan.topology.domain_of(flow.publisher).label
-            domain = folder / "domains" / label
-            words = ["cert", "revoke", str(node / NODE_CERTIFICATE), "--domain", str(domain), "--out", str(out)]
+    Raises ``FailedError``: the flows did not come up, or a process ended by itself.
+    """
+    flows, arrivals_ns = overlay.plan.flows, overlay.books.arrivals_ns
+    until(
+        lambda: len(arrivals_ns) == len(flows),
+        lambda: f"{len(arrivals_ns)} of {len(flows)} flows are read",
+        STEADY_S,
+        lambda: overlay.watch(LOOK_S, is_strict=True),
+    )
+    order = list(range(len(flows)))
+    random.Random(1).shuffle(order)
+    for channel in order:
+        is_delegation = flows[channel].publisher == "P"
+        what = "delegation" if is_delegation else "membership"
+        words = _revocation(overlay, flows[channel]) if is_delegation else overlay.revocation(flows[channel].publisher)
+        time.sleep(0.2 + random.random() * 0.5)
         begun_ns = time.monotonic_ns()
         gdp(*words)
-        read_public(out)
+        read_public(Path(words[-1]))
         signalled_ns = time.monotonic_ns()
-        self._overlay.processes[f"switch {HANDED_IN_AT}"].send(signal.SIGHUP)
-        return begun_ns, signalled_ns
+        overlay.processes[f"switch {HANDED_IN_AT}"].send(signal.SIGHUP)
+        overlay.watch(AFTER_S, is_strict=True)
+        last_ns = arrivals_ns[channel, "R"][-1]
+        took_ms = max(last_ns - signalled_ns, 0) / 1e6
+        over.add(what, CASE, SIGNAL, took_ms)
+        over.add(what, CASE, COMMAND, (last_ns - begun_ns) / 1e6)
+        over.add(what, CASE, OPEN, float(last_ns > signalled_ns + round((AFTER_S - 0.5) * 1e9)))
+        progress(f"  {flows[channel].topic}: {took_ms:.0f} ms")
+
+
+def _revocation(overlay: Overlay, flow: Flow) -> list[str]:
+    """Return the words of ``gdp`` that revoke a delegation, as ``Overlay.revocation``."""
+    folder = overlay.directory
+    name = load_owner(folder / "owner").subject(Metadata({"kind": "topic", "name": flow.topic})).name
+    file = folder / "nodes" / f"proxy-{flow.publisher}" / "delegations" / f"{name.to_text()}.delegation"
+    out = folder / "revocations" / f"{name.to_text()}.revoke"
+    return ["delegate", "revoke", str(file), "--owner", str(folder / "owner"), "--out", str(out)]
 
 
 if __name__ == "__main__":

@@ -40,8 +40,7 @@ class Outcome:
 
     Attributes:
         name: of the record, and of its files below ``docs/benchmarks``.
-        panels: makes the picture; only called when it is drawn.
-        is_whole: False where only ``--json`` writes a file.
+        panels: of the picture.
         keeps_rows: rows of an earlier record that were not measured now are kept.
         has_failed: ends the command with 1.
     """
@@ -51,8 +50,7 @@ class Outcome:
     rounds: Rounds
     targets: Sequence[Target]
     settings: Settings
-    panels: Callable[[], Sequence[Panel]] | None = None
-    is_whole: bool = True
+    panels: Sequence[Panel] = ()
     keeps_rows: bool = False
     has_failed: bool = False
 
@@ -174,7 +172,7 @@ def run_bench(parser: argparse.ArgumentParser, measure: Callable[[Options], Outc
 def perform(options: Options, measure: Callable[[Options], Outcome]) -> None:
     """Run a bench to its table, JSON record and picture."""
     is_saved = not getattr(options, "no_save", False)
-    is_drawn = is_saved and not getattr(options, "no_plot", True)
+    is_drawn = is_saved and _is_whole(options) and not getattr(options, "no_plot", True)
     if is_drawn:
         require_plot()
     state, begun_s = machine_state(), time.monotonic()
@@ -192,25 +190,31 @@ def _require_page(options: Options, state: MachineState) -> None:
     """Refuse to measure for files that could not be written, or not be trusted. Raises ``RefusedError``: such files."""
     is_quick = getattr(options, "quick", False)
     chosen: Path | None = getattr(options, "json", None)
-    is_whole = getattr(options, "is_whole", None)
     if chosen or not is_quick:
         require_writable(chosen.parent if chosen else OUTPUT)
-    if not is_quick and (chosen or is_whole is None or is_whole(options)):
+    if not is_quick and (chosen or _is_whole(options)):
         require_trust(state, allow_load=options.allow_load)
+
+
+def _is_whole(options: Options) -> bool:
+    """Return whether a bench measures all that its files below ``docs/benchmarks`` have; a part needs ``--json``."""
+    is_whole: Callable[[Options], bool] | None = getattr(options, "is_whole", None)
+    return not getattr(options, "quick", False) and (is_whole is None or is_whole(options))
 
 
 def finish(
     outcome: Outcome, options: Options, state: MachineState, took_s: float, *, is_saved: bool, is_drawn: bool
 ) -> None:
     """Print an outcome, and write the files that the options select."""
-    settings: Settings = {**outcome.settings, "burst core": VARIANT, "took, s": round(took_s)}
+    rounds = {"rounds": options.rounds} if hasattr(options, "rounds") else {}
+    settings: Settings = {**rounds, **outcome.settings, "burst core": VARIANT, "took, s": round(took_s)}
     show(outcome.title, state, settings, outcome.rounds, outcome.targets)
-    own = OUTPUT if outcome.is_whole and not getattr(options, "quick", False) else None
+    own = OUTPUT if _is_whole(options) else None
     record = getattr(options, "json", None) or (own and own / f"{outcome.name}.json")
     if is_saved and record:
         write_json(record, outcome.name, state, settings, outcome.rounds, outcome.targets, keeps=outcome.keeps_rows)
-    if is_drawn and own and outcome.panels is not None:
-        save_bars(own / f"{outcome.name}.png", outcome.title, str(state), outcome.panels())
+    if is_drawn and own:
+        save_bars(own / f"{outcome.name}.png", outcome.title, str(state), outcome.panels)
     is_missed = any(target.met is False for target in outcome.targets)
     if outcome.has_failed or (getattr(options, "strict", False) and is_missed):
         sys.exit(1)

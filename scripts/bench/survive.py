@@ -16,11 +16,8 @@ from __future__ import annotations
 import random
 import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections import Counter
 from itertools import pairwise
-from pathlib import Path
 from typing import Final
 
 from faults.overlay import LOOK_S, Overlay
@@ -33,6 +30,7 @@ from lab.process import FailedError, new_run
 
 ROUNDS: Final = 30
 HZ: Final = 500.0
+CASE: Final = f"a flow of {HZ:g} messages/s"
 DEAD_S: Final = 80.0  # longer than three leases of 24 s
 SETTLE_S: Final = 11.0  # longer than a link that came and went is left out of routes
 STEADY_S: Final = 0.5  # a flow that had no gap above ``STEADY_GAP_S`` for so long is steady
@@ -41,28 +39,7 @@ PATIENCE_S: Final = 40.0  # longer than a lease
 PHASE_S: Final = 0.5  # longest random wait before an event
 LAST_S: Final = 2.0
 SILENCE, RETURN, P99 = "silence, ms", "after undo, ms", "p99, ms"
-
-
-@dataclass(slots=True)
-class Measured:
-    """Result of a row: seconds, one figure an event.
-
-    Attributes:
-        silence_s: from the event on.
-        return_s: the same after the event is undone.
-        new_name_s: until a name that is new after the event was read.
-        reported_lost: losses of the steady flow that R got a report of.
-        never: events after which the flow did not come back in time; their silence is at least the patience.
-    """
-
-    silence_s: list[float] = field(default_factory=list)
-    return_s: list[float] = field(default_factory=list)
-    new_name_s: list[float] = field(default_factory=list)
-    published: int = 0
-    lost: int = 0
-    reported_lost: int = 0
-    doubled: int = 0
-    never: int = 0
+PUBLISHED, LOST, REPORTED, DOUBLED, NEVER = "published", "lost", "reported", "doubled", "no return"
 
 
 class Flowing:
@@ -84,11 +61,9 @@ class Flowing:
     def await_steady(self, since_ns: int, patience_s: float = PATIENCE_S) -> bool:
         """Return whether the flow became steady in time."""
         end_s = time.monotonic() + patience_s
-        while time.monotonic() < end_s:
+        while not (is_steady := self.is_steady(since_ns)) and time.monotonic() < end_s:
             self._overlay.watch(LOOK_S, is_strict=True)
-            if self.is_steady(since_ns):
-                return True
-        return False
+        return is_steady
 
     def silence_s(self, since_ns: int) -> float:
         """Return the longest time between consecutive arrivals, the last before a moment included; up to now."""
@@ -98,18 +73,14 @@ class Flowing:
         return max((b - a for a, b in pairwise(marks)), default=0) / 1e9
 
 
-def measure_row(row: Row, rounds: int, options: Options) -> Measured:
-    """Make the event of a row happen so often.
+def measure_row(row: Row, rounds: int, options: Options) -> tuple[Rounds, list[Target]]:
+    """Make the event of a row happen so often; return its figures and targets.
 
     Raises ``FailedError``: the network did not come up, or a process ended by itself. Raises ``GdpError``: the kernel
     refuses.
     """
-    found = Measured()
-    with (
-        new_run() as run,
-        Overlay(run, row.plan(HZ), has_journals=options.journals is not None) as overlay,
-        _journals_kept(overlay, row, found, options.journals),
-    ):
+    found, counts = Rounds(), Counter[str]()
+    with new_run() as run, Overlay(run, row.plan(HZ)) as overlay:
         overlay.start_all()
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
@@ -117,109 +88,85 @@ def measure_row(row: Row, rounds: int, options: Options) -> Measured:
         # path computation waits longer in a network that has just started (RFC 8405)
         overlay.watch(options.settle_s, is_strict=True)
         for at in range(rounds):
-            _once(overlay, flow, row, at, found, options)
+            counts[NEVER] += _once(overlay, flow, row, at, found, options)
         books = overlay.books
-        found.published = len(books.published[0, 1])
+        counts[PUBLISHED] = len(books.published[0, 1])
         overlay.watch(LAST_S, is_strict=True)
         account = books.accounts[0, "R", 1, 1]
-        found.lost, found.doubled = account.missing(found.published), account.doubled
-        found.reported_lost = books.reported_losses[0, "R", 1]
-    return found
+        counts[LOST], counts[DOUBLED] = account.missing(counts[PUBLISHED]), account.doubled
+        counts[REPORTED] = books.reported_losses[0, "R", 1]
+    targets = []
+    for what, target_s in ((row.what, row.target_s), (row.new_name, row.new_name_s)):
+        if times_ms := [each for each in found.column(what, CASE, SILENCE) if each is not None]:
+            found.add(what, CASE, P99, percentile(times_ms, 0.99))
+            # A silence of nothing is compared with the row ``nothing``.
+            target_ms = 1e3 * target_s if target_s else None
+            targets.append(found.target(f"{what}: {P99}", what, CASE, P99, target_ms, at_most=True))
+    for column in (PUBLISHED, LOST, REPORTED, DOUBLED, NEVER):
+        found.add(row.what, CASE, column, counts[column])
+    failed = counts[LOST] + counts[DOUBLED] + counts[NEVER]
+    return found, [*targets, Target(f"{row.what}: lost, doubled or without return", 0, True, Spread.of([failed]))]
 
 
-@contextmanager
-def _journals_kept(overlay: Overlay, row: Row, found: Measured, folder: Path | None) -> Iterator[None]:
-    """Save the journals of a row that has failed or lost something."""
-    try:
-        yield
-    except GdpError:
-        found.never += 1
-        raise
-    finally:
-        if folder is not None and (found.lost or found.never):
-            overlay.save_journals(folder / row.what.replace(" ", "-"))
-
-
-def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, options: Options) -> None:
+def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Rounds, options: Options) -> int:
+    """Make the event happen once; return how often the flow did not come back, whose silence is that until then."""
     time.sleep(random.random() * PHASE_S)  # events hit any phase of every timer
     since_ns = time.monotonic_ns()
     row.fail(overlay, at)
     if row.new_name_s is not None:
-        found.new_name_s.append(_new_name_s(overlay, at))
+        found.add(row.new_name, CASE, SILENCE, 1e3 * _new_name_s(overlay, at))
     if row.holds:
         overlay.watch(options.dead_s, is_strict=True)
     patience_s = 0.1 if row.holds and options.dead_s >= PATIENCE_S and not flow.is_steady(since_ns) else PATIENCE_S
-    found.never += not flow.await_steady(since_ns, patience_s)
-    found.silence_s.append(flow.silence_s(since_ns))
-    progress(f"  {at + 1}: {found.silence_s[-1] * 1e3:.1f} ms")
-    if row.undo is not None:
-        since_ns = time.monotonic_ns()
-        row.undo(overlay, at)
-        found.never += not flow.await_steady(max(since_ns, time.monotonic_ns()))
-        found.return_s.append(flow.silence_s(since_ns))
-        overlay.watch(options.settle_s, is_strict=True)
+    never = int(not flow.await_steady(since_ns, patience_s))
+    silence_ms = 1e3 * flow.silence_s(since_ns)
+    found.add(row.what, CASE, SILENCE, silence_ms)
+    progress(f"  {at + 1}: {silence_ms:.1f} ms")
+    if not overlay.active:
+        return never
+    since_ns = time.monotonic_ns()
+    for fault in list(overlay.active):
+        overlay.end(fault)
+    never += not flow.await_steady(time.monotonic_ns())
+    found.add(row.what, CASE, RETURN, 1e3 * flow.silence_s(since_ns))
+    overlay.watch(options.settle_s, is_strict=True)
+    return never
 
 
 def _new_name_s(overlay: Overlay, at: int) -> float:
     """Make P publish, and R read, an unknown name; return the seconds until its first message."""
-    arrivals_ns = overlay.books.arrivals_ns[len(overlay.plan.flows) + len(overlay.plan.services) + at, "R"]
-    begun_ns = time.monotonic_ns()
+    arrivals_ns, begun_ns = overlay.books.arrivals_ns[1 + at, "R"], time.monotonic_ns()
     for who in ("member P", "member R"):
         overlay.processes[who].send(signal.SIGUSR1)
-    end_s = time.monotonic() + PATIENCE_S
-    while not arrivals_ns and time.monotonic() < end_s:
+    while not arrivals_ns and time.monotonic_ns() < begun_ns + PATIENCE_S * 1e9:
         overlay.watch(LOOK_S, is_strict=True)
     return ((arrivals_ns or [time.monotonic_ns()])[0] - begun_ns) / 1e9
 
 
-def add(over: Rounds, row: Row, case: str, found: Measured) -> list[Target]:
-    """Add the figures of a row; return its targets."""
-    asked = [(row.what, found.silence_s, row.target_s)]
-    if found.new_name_s:
-        asked.append((f"{row.what}: until a new name is read", found.new_name_s, row.new_name_s))
-    targets = []
-    for who, seconds, target_s in asked:
-        for each in seconds:
-            over.add(who, case, SILENCE, 1e3 * each)
-        over.add(who, case, P99, 1e3 * percentile(seconds, 0.99))
-        # A silence of nothing is compared with the row ``nothing``.
-        target_ms = 1e3 * target_s if target_s else None
-        targets.append(over.target(f"{who}: {P99}", who, case, P99, target_ms, at_most=True))
-    for each in found.return_s:
-        over.add(row.what, case, RETURN, 1e3 * each)
-    counts = {"published": found.published, "lost": found.lost, "reported": found.reported_lost}
-    counts |= {"doubled": found.doubled, "no return": found.never}
-    for column, count in counts.items():
-        over.add(row.what, case, column, count)
-    faults = found.lost + found.doubled + found.never
-    return [*targets, Target(f"{row.what}: lost, doubled or without return", 0, True, Spread.of([faults]))]
-
-
 def measure(options: Options) -> Outcome:
     """Measure every row; one that fails is noted."""
-    if options.quick:
-        options.dead_s, options.settle_s = 3.0, 0.0
     over, targets, notes = Rounds(), list[Target](), list[str]()
-    case = f"a flow of {HZ:g} messages/s"
     for name in options.only or ROWS:
         row = ROWS[name]
         rounds = min(options.rounds, NEW_TOPICS) if row.new_name_s is not None else options.rounds
         rounds = min(rounds, 3) if row.holds else rounds
         progress(f"{name}: {row.what}, {rounds} times")
         try:
-            targets += add(over, row, case, measure_row(row, rounds, options))
+            found, asked = measure_row(row, rounds, options)
+            over.values |= found.values
+            targets += asked
         except GdpError as error:
             notes.append(f"{name}: {error}")
             progress(f"FAILED {notes[-1]}")
-    settings = {"events a row": options.rounds, "trouble": notes or "none"}
+    settings = {"trouble": notes or "none"}
     title = "Silence when something fails or moves"
     return Outcome("survive", title, over, targets, settings, keeps_rows=True, has_failed=bool(notes))
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__, rounds=ROUNDS, quick={"rounds": 1}, has_record=True)
+    quick = {"rounds": 1, "dead_s": 3.0, "settle_s": 0.0}
+    parser = command_line(__doc__, rounds=ROUNDS, quick=quick, has_record=True)
     parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
-    parser.add_argument("--journals", type=Path, help="keep journals, and save those of a row that loses or fails here")
     parser.add_argument("--dead-s", type=float, default=DEAD_S, help="how long no RIB lives (default: %(default)s)")
-    parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="after it is undone (default: %(default)s)")
+    parser.set_defaults(settle_s=SETTLE_S)
     run_bench(parser, measure)

@@ -16,12 +16,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, TypedDict
+from functools import partial
+from typing import Final
 
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 
 from lab.faults import Fault, FaultKind
+from lab.namespaces import received
 from lab.topology import Link, ends_of, make_topology
 
 CUT, KILL = FaultKind.CUT, FaultKind.KILL_SWITCH
@@ -39,8 +41,8 @@ class Row:
         what: in words.
         target_s: most seconds of silence at the 99th percentile; None: reported without a target.
         plan: the network, for a rate of messages a second.
-        fail: makes the event happen; gets the overlay and the number of the round, from 0.
-        undo: undoes it; None where the next event may start from this state.
+        fail: makes the event happen; gets the overlay and the number of the round, from 0. Faults that it leaves are
+            undone; without one, the next event starts from this state.
         new_name_s: most seconds until a new name is read; None: not measured.
         holds: the event lasts for the bench's ``--dead-s``.
     """
@@ -49,9 +51,13 @@ class Row:
     target_s: float | None
     plan: Callable[[float], Plan]
     fail: Callable[[Overlay, int], None]
-    undo: Callable[[Overlay, int], None] | None = None
     new_name_s: float | None = None
     holds: bool = False
+
+    @property
+    def new_name(self) -> str:
+        """Return the label of the figures of a new name."""
+        return f"{self.what}: until a new name is read"
 
 
 def _flows(hz: float) -> tuple[Flow, ...]:
@@ -66,8 +72,8 @@ def _square(hz: float, ribs: tuple[str, ...] = ("s3",), *, new_names: bool = Fal
         ribs,
         {"P": "s1", "R": "s4"},
     )
-    spare = tuple(Flow(f"/new/{n}", "P", ("R",), hz=50.0) for n in range(NEW_TOPICS)) if new_names else ()
-    return Plan(topology, members, flows=_flows(hz), spare=spare)
+    new = (Flow(f"/new/{n}", "P", ("R",), hz=50.0, waits=True) for n in range(NEW_TOPICS if new_names else 0))
+    return Plan(topology, members, flows=(*_flows(hz), *new))
 
 
 def _borders(hz: float) -> Plan:
@@ -112,15 +118,8 @@ def _move(*movers: str) -> Callable[[Overlay, int], None]:
     return move
 
 
-class Both(TypedDict):
-    """Keys of a row that make an event and undo it."""
-
-    fail: Callable[[Overlay, int], None]
-    undo: Callable[[Overlay, int], None]
-
-
-class _OnPath:
-    """Fault of the switch, or the link to or from it, that the flow uses at that moment.
+def _on_path(kind: FaultKind, last: str = "s4", **ways: str) -> Callable[[Overlay, int], None]:
+    """Return what breaks the switch, or the link to or from it, that the flow uses at that moment.
 
     A link that came back may be left out of routes for seconds (damping), so the path is not always the cheaper one.
     The busier of the last switch's two devices shows the path.
@@ -131,40 +130,29 @@ class _OnPath:
         ways: the switch before it on the flow's path, and what fails then.
     """
 
-    def __init__(self, kind: FaultKind, last: str, **ways: str) -> None:
-        self._kind, self._last, self._ways = kind, last, ways
-        self._fault = Fault(kind, (), 0.0)
-
-    def fail(self, overlay: Overlay, _: int) -> None:
-        before = overlay.received(self._last, list(self._ways))
+    def fail(overlay: Overlay, _: int) -> None:
+        space, frames = overlay.spaces[last], partial(received, list(ways))
+        before = space.inside(frames)
         time.sleep(_COUNT_S)
-        after = overlay.received(self._last, list(self._ways))
-        failed = self._ways[max(self._ways, key=lambda way: after[way] - before[way])]
-        targets = (failed,) if self._kind is FaultKind.KILL_SWITCH else ends_of(failed)
-        self._fault = Fault(self._kind, targets, 0.0)
-        overlay.begin(self._fault)
+        after = space.inside(frames)
+        failed = ways[max(ways, key=lambda way: after[way] - before[way])]
+        overlay.begin(Fault(kind, (failed,) if kind is FaultKind.KILL_SWITCH else ends_of(failed), 0.0))
 
-    def undo(self, overlay: Overlay, _: int) -> None:
-        overlay.end(self._fault)
+    return fail
 
 
-def _on_path(kind: FaultKind, last: str = "s4", **ways: str) -> Both:
-    """Return the keys of a row with such a fault."""
-    fault = _OnPath(kind, last, **ways)
-    return {"fail": fault.fail, "undo": fault.undo}
-
-
-def _one_rib(overlay: Overlay, at: int) -> str:
-    return f"rib {overlay.plan.ribs[at % len(overlay.plan.ribs)]}"
-
-
-def _all_ribs(overlay: Overlay) -> list[str]:
-    return [f"rib {node}" for node in overlay.plan.ribs]
+def _kill_one_rib(overlay: Overlay, at: int) -> None:
+    ribs = overlay.plan.ribs
+    overlay.begin(Fault(FaultKind.KILL_RIB, (f"rib {ribs[at % len(ribs)]}",), 0.0))
 
 
 def _kill_all_ribs(overlay: Overlay, _: int) -> None:
-    for who in _all_ribs(overlay):
-        overlay.kill(who)
+    for at in range(len(overlay.plan.ribs)):
+        _kill_one_rib(overlay, at)
+
+
+def _two_ribs(hz: float) -> Plan:
+    return _square(hz, ("s3", "s2"), new_names=True)
 
 
 ROWS: Final[dict[str, Row]] = {
@@ -176,20 +164,12 @@ ROWS: Final[dict[str, Row]] = {
         "roaming, both ends at once", 0.8, lambda hz: _star(hz, {"P": ("a1", "b1"), "R": ("c1", "d1")}), _move("P", "R")
     ),
     "cut-alternate": Row(
-        "link cut, carrier seen, with an alternate", 0.005, _square, **_on_path(CUT, s2="s1-s2", s3="s1-s3")
+        "link cut, carrier seen, with an alternate", 0.005, _square, _on_path(CUT, s2="s1-s2", s3="s1-s3")
     ),
-    "cut": Row("link cut, carrier seen, without an alternate", 0.05, _square, **_on_path(CUT, s2="s2-s4", s3="s3-s4")),
-    "silent": Row("link cut, silent", 0.25, _square, **_on_path(FaultKind.SILENT, s2="s1-s2", s3="s1-s3")),
-    "switch": Row("switch on the path killed", 0.3, _square, **_on_path(KILL, s2="switch s2", s3="switch s3")),
-    "border": Row("border killed", 0.5, _borders, **_on_path(KILL, "b1", b2="switch a2", b3="switch a3")),
-    "rib": Row(
-        "any one RIB of two killed", 0.0, lambda hz: _square(hz, ("s3", "s2"), new_names=True),
-        lambda overlay, at: overlay.kill(_one_rib(overlay, at)),
-        lambda overlay, at: overlay.restart(_one_rib(overlay, at)),
-        new_name_s=0.3,
-    ),
-    "ribs": Row(
-        "all RIBs dead", 0.0, lambda hz: _square(hz, ("s3", "s2")), _kill_all_ribs,
-        lambda overlay, _: overlay.restart(*_all_ribs(overlay)), holds=True,
-    ),
-}  # fmt: skip
+    "cut": Row("link cut, carrier seen, without an alternate", 0.05, _square, _on_path(CUT, s2="s2-s4", s3="s3-s4")),
+    "silent": Row("link cut, silent", 0.25, _square, _on_path(FaultKind.SILENT, s2="s1-s2", s3="s1-s3")),
+    "switch": Row("switch on the path killed", 0.3, _square, _on_path(KILL, s2="switch s2", s3="switch s3")),
+    "border": Row("border killed", 0.5, _borders, _on_path(KILL, "b1", b2="switch a2", b3="switch a3")),
+    "rib": Row("any one RIB of two killed", 0.0, _two_ribs, _kill_one_rib, new_name_s=0.3),
+    "ribs": Row("all RIBs dead", 0.0, _two_ribs, _kill_all_ribs, holds=True),
+}

@@ -10,7 +10,7 @@ FIFO in each direction. On the same link and seed, one after the other:
 Each carries camera (30 Hz, raw or JPEG, best effort), lidar (10 Hz), tf (100 Hz), a map, service calls, and cmd_vel
 back (50 Hz): alone, then with one TCP flow (CUBIC) from the robot. Ages are one way, from when a message was due.
 
-    sudo .venv/bin/python scripts/bench/uplink.py                     # a small grid; writes docs/benchmarks/uplink.*
+    sudo .venv/bin/python scripts/bench/uplink.py                     # a small grid; writes docs/benchmarks/uplink.json
     sudo .venv/bin/python scripts/bench/uplink.py --quick --no-save   # a few seconds each: does it work?
     sudo .venv/bin/python scripts/bench/uplink.py --only gdp --rates 1 5 --rtt 10 --loss 0 burst --fifo bdp --no-save
     sudo .venv/bin/python scripts/bench/uplink.py --rates Verizon-LTE-short --no-save
@@ -19,22 +19,22 @@ back (50 Hz): alone, then with one TCP flow (CUBIC) from the robot. Ages are one
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Final
 
 from machine import DATA, RefusedError
-from plot import Panel, panel_of
-from report import Rounds, Target, progress
+from report import Rounds, Target
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link import score
 from thin_link.conditions import FIFOS, LOSSES, Conditions
+from thin_link.exchange import Tally
 from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
-from thin_link.score import LINK_COLUMNS, STREAM_COLUMNS, Report, link_figures, merged, stream_figures, whole_share
-from thin_link.systems import SYSTEMS, System, start_role
+from thin_link.score import LINK_COLUMNS, STREAM_COLUMNS, link_figures, merged, stream_figures, whole_share
+from thin_link.systems import SYSTEMS, System, run_window, start_role
 from thin_link.traffic import CAMERA_BYTES, carried_s, streams, wire_bytes
 
 from gdp.errors import LocalError
@@ -52,7 +52,6 @@ GRID: Final = (  # rate, round trip in ms, loss, FIFO
 RECORDED: Final = ("Verizon-LTE-short", 60.0, "0", "second")
 RTTS_MS: Final = (10.0, 60.0, 200.0)
 WARM_UP_S: Final = 3.0
-DRAIN_S: Final = 2.5
 READY_S: Final = 30.0
 RAW_CAMERA_BITS_S: Final = 50e6  # from this rate on, the camera is not compressed
 _FIGURES: Final = {"cmd_vel": 15.0, "tf": 15.0}  # asked: age p99 over idle, ms
@@ -71,7 +70,7 @@ def camera_of(link: Conditions, choice: str) -> str:
     """Return the camera on a link: the chosen one, or by its rate."""
     if choice != "auto":
         return choice
-    return "raw" if link.up.mean_bits_s >= RAW_CAMERA_BITS_S else "jpeg"
+    return "raw" if link.up.bits_s >= RAW_CAMERA_BITS_S else "jpeg"
 
 
 def links_of(options: Options) -> list[Conditions]:
@@ -79,16 +78,10 @@ def links_of(options: Options) -> list[Conditions]:
 
     Raises ``RefusedError``: an unknown word, or a recording that is not there.
     """
-    if any((options.rates, options.rtt, options.loss, options.fifo)):
-        words = [
-            (rate, rtt, loss, fifo)
-            for rate in options.rates or ["10"]
-            for rtt in options.rtt or [60.0]
-            for loss in options.loss or ["0"]
-            for fifo in options.fifo or ["second"]
-        ]
-    else:
-        words = [*GRID[:1]] if options.quick else [*GRID, RECORDED]
+    chosen = (options.rates, options.rtt, options.loss, options.fifo)
+    words = [*GRID[:1]] if options.quick else [*GRID, RECORDED]
+    if any(chosen):
+        words = list(product(*(each or [usual] for each, usual in zip(chosen, GRID[0], strict=True))))
     try:
         return [Conditions.of(*each, seed=options.seed, traces=options.traces) for each in words]
     except LocalError as error:
@@ -97,7 +90,7 @@ def links_of(options: Options) -> list[Conditions]:
 
 def exchange(
     lab: Lab, link: Conditions, system: System | None, options: Options, *, with_tcp: bool
-) -> tuple[Used, Mapping[str, Report]]:
+) -> tuple[Used, Mapping[str, Tally]]:
     """Run the traffic of a system once (None: no system), with or without the TCP flow; return use and reports.
 
     Raises ``FailedError``: a process did not come up, or ended.
@@ -105,60 +98,38 @@ def exchange(
     camera = camera_of(link, options.camera)
     with ExitStack() as stack:
         line = stack.enter_context(open_line(lab, link))
-        ends = stack.enter_context(system.run(lab, camera)) if system else ()
+        ends = stack.enter_context(system(lab, camera)) if system else ()
         if with_tcp:
             stack.enter_context(start_role(lab, CLOUD, "tcp-read", {"address": ADDRESSES[CLOUD]})).read(READY_S)
             stack.enter_context(start_role(lab, ROBOT, "tcp-send", {"address": ADDRESSES[CLOUD]})).read(READY_S)
-        line.rewind()
-        start_ns = time.monotonic_ns() + 50_000_000
-        begin_ns = start_ns + round(WARM_UP_S * 1e9)
-        end_ns = begin_ns + round(options.seconds * 1e9)
-        for end in ends:
-            end.tell(start_ns=start_ns, begin_ns=begin_ns, end_ns=end_ns, drained_ns=end_ns + round(DRAIN_S * 1e9))
-        time.sleep((begin_ns - time.monotonic_ns()) / 1e9)
-        line.begin()
-        time.sleep((end_ns - time.monotonic_ns()) / 1e9)
-        used = line.end()
-        said = [end.read(READY_S) for end in ends]
-    if not said:
-        return used, {}
-    for each in said:
-        if each["refusals"]:
-            progress(f"refused: {each['refusals']}")
-    robot, cloud = (each["streams"] for each in said)
-    return used, merged(streams(camera), robot, cloud)
+        (used,), said = run_window([line], ends, options.seconds, WARM_UP_S)
+    return used, merged(streams(camera), *(each["streams"] for each in said)) if said else {}
 
 
-def measure_system(lab: Lab, link: Conditions, system: System, options: Options, over: Rounds) -> dict[str, float]:
+def measure_system(lab: Lab, link: Conditions, name: str, options: Options, over: Rounds, _: int) -> dict[str, float]:
     """Return the figures of a system on a link, and add those of its streams."""
+    if name == TCP:
+        used = exchange(lab, link, None, options, with_tcp=True)[0]
+        return {score.TCP_ALONE: used.up.marked_share, score.RELAY_LATE: used.late_ms}
     mix = streams(camera_of(link, options.camera))
-    used, reports = exchange(lab, link, system, options, with_tcp=False)
+    used, reports = exchange(lab, link, SYSTEMS[name], options, with_tcp=False)
     could_s = carried_s(mix, 8 * used.up.capacity_bytes / options.seconds, link.up.loss)
     for each in mix:
         found = stream_figures(each, reports[each.name], link, mix, could_s, options.seconds)
         for column in STREAM_COLUMNS if each.bulk else STREAM_COLUMNS[:-1]:
-            over.add(system.name, case_of(link, each.name), column, found.get(column))
-    both = exchange(lab, link, system, options, with_tcp=True)[0] if options.tcp else None
+            over.add(name, case_of(link, each.name), column, found.get(column))
+    both = exchange(lab, link, SYSTEMS[name], options, with_tcp=True)[0] if options.tcp else None
     return {**link_figures(link, used, both), score.WHOLE: whole_share(mix, reports, could_s, options.seconds)}
-
-
-def measure_tcp(lab: Lab, link: Conditions, options: Options) -> dict[str, float]:
-    """Return the share of the link that the TCP flow has alone."""
-    used, _ = exchange(lab, link, None, options, with_tcp=True)
-    return {score.TCP_ALONE: used.up.marked_share, score.RELAY_LATE: used.late_ms}
 
 
 def trials_of(lab: Lab, link: Conditions, options: Options, over: Rounds) -> list[Trial]:
     """Return the trials of one link: TCP alone, then every system."""
-    chosen = options.only or [TCP, *SYSTEMS]
-    case, trials = case_of(link, "link"), []
-    if TCP in chosen and options.tcp:
-        columns = (score.TCP_ALONE, score.RELAY_LATE)
-        trials.append(Trial(case, TCP, columns, lambda _: measure_tcp(lab, link, options)))
-    for name in chosen:
-        if name in SYSTEMS:
-            run = partial(measure_system, lab, link, SYSTEMS[name], options, over)
-            trials.append(Trial(case, name, LINK_COLUMNS, lambda _, run=run: run()))  # type: ignore[misc]
+    trials = []
+    for name in options.only or [TCP, *SYSTEMS]:
+        if options.tcp or name != TCP:
+            columns = (score.TCP_ALONE, score.RELAY_LATE) if name == TCP else LINK_COLUMNS
+            work = partial(measure_system, lab, link, name, options, over)
+            trials.append(Trial(case_of(link, "link"), name, columns, work))
     return trials
 
 
@@ -179,7 +150,7 @@ def targets_of(over: Rounds, links: Sequence[Conditions], choice: str) -> list[T
             case = case_of(link, stream)
             targets.append(over.target(f"{case}, {score.OVER_IDLE}", OURS, case, score.OVER_IDLE, asked, at_most=True))
         case, camera = case_of(link, "camera"), camera_of(link, choice)
-        age_ms = _AGE_MS + wire_bytes(CAMERA_BYTES[camera]) * 8e3 / link.up.mean_bits_s
+        age_ms = _AGE_MS + wire_bytes(CAMERA_BYTES[camera]) * 8e3 / link.up.bits_s
         targets.append(over.target(f"{case}, {score.AGE_P99}", OURS, case, score.AGE_P99, age_ms, at_most=True))
         share = _SATURATED_SHARE if camera == "raw" else _FRESH_SHARE
         targets.append(over.target(f"{case}, {score.OF_LINK}", OURS, case, score.OF_LINK, share))
@@ -198,18 +169,6 @@ def targets_of(over: Rounds, links: Sequence[Conditions], choice: str) -> list[T
     return targets
 
 
-def panels_of(over: Rounds, links: Sequence[Conditions]) -> list[Panel]:
-    """Return panels of each link: urgent ages, images, and the share with TCP."""
-    panels = []
-    for link in links:
-        for stream in ("cmd_vel", "tf"):
-            case = case_of(link, stream)
-            panels.append(panel_of(over, case, score.AGE_P50, list(SYSTEMS), p99=score.AGE_P99, ours=[OURS], log=True))
-        panels.append(panel_of(over, case_of(link, "camera"), score.OF_LINK, list(SYSTEMS), ours=[OURS]))
-        panels.append(panel_of(over, case_of(link, "link"), score.SHARE_BOTH, list(SYSTEMS), ours=[OURS]))
-    return panels
-
-
 def measure(options: Options) -> Outcome:
     """Measure every system on every link, round by round."""
     recorder, links = Recorder(), links_of(options)
@@ -226,7 +185,6 @@ def measure(options: Options) -> Outcome:
         over,
         targets_of(over, links, options.camera) if not options.only or OURS in options.only else [],
         {
-            "rounds": options.rounds,
             "seconds of each figure": options.seconds,
             "warm-up, s": WARM_UP_S,
             "seed": options.seed,
@@ -235,16 +193,13 @@ def measure(options: Options) -> Outcome:
             "camera, B": [CAMERA_BYTES[camera_of(link, options.camera)] for link in links],
             "trouble": recorder.notes or "none",
         },
-        lambda: panels_of(over, links),
         keeps_rows=bool(options.only),
     )
 
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = command_line(
-        __doc__, rounds=1, seconds=6.0, quick={"rounds": 1, "seconds": 2.0}, has_record=True, has_plot=True
-    )
+    parser = command_line(__doc__, rounds=1, seconds=6.0, quick={"rounds": 1, "seconds": 2.0}, has_record=True)
     parser.add_argument("--only", nargs="+", choices=[TCP, *SYSTEMS], help="these rows")
     parser.add_argument("--rates", nargs="+", help="Mbit/s, or names of recordings; 1, 5, 20 and 100 are of interest")
     parser.add_argument("--rtt", nargs="+", type=float, help=f"ms, such as {RTTS_MS}")

@@ -83,7 +83,6 @@ def measure(options: Options) -> Outcome:
             for column in (LOST, DOUBLED)
         ]
     settings = {
-        "rounds": options.rounds,
         "messages": sum(len(flow.sent_s) for flow in flows.values()),
         "limit, paths: 2, ms": round(limits[2]),
     }

@@ -8,57 +8,39 @@ Processes of their own, started by ``uplink.py``::
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
-from peers.jsonl import read_order, say
-from thin_link.exchange import Arrival, Carrier, Exchange, Window
+from peers.jsonl import Settings, read_order, run_role, say
+from thin_link.carriers import CARRIERS
+from thin_link.exchange import Exchange, Window
 from thin_link.relay import MARKED_PORT
 from thin_link.traffic import Direction, streams
 
+from lab.process import until
+
 _PATIENCE_S: Final = 30.0
-_POLL_S: Final = 0.02
 _CHUNK: Final = 1 << 16
-
-Settings = Mapping[str, Any]
-
-
-def _carrier(settings: Settings, arrived: Arrival) -> Carrier:
-    """Return the end of the system; its library is loaded by none other."""
-    own = dict(settings["own"])
-    if settings["system"] == "gdp":
-        from thin_link.gdp_carrier import GdpCarrier
-
-        return GdpCarrier(own, arrived)
-    from thin_link.zenoh_carrier import ZenohCarrier
-
-    return ZenohCarrier(own, arrived)
 
 
 def traffic(settings: Settings, direction: Direction) -> None:
     """Exchange the traffic once for each command with a window; report every stream after it."""
     exchange = Exchange(streams(settings["camera"]), direction)
-    carrier = _carrier(settings, exchange.take)
+    carrier = CARRIERS[settings["system"]](settings["own"], exchange.take)
     exchange.join(carrier)
-    deadline_s = time.monotonic() + _PATIENCE_S
-    while not carrier.is_matched():
-        if time.monotonic() > deadline_s:
-            raise TimeoutError("no reader: the other end did not appear")
-        time.sleep(_POLL_S)
+    until(carrier.is_matched, "a reader: the other end did not appear", _PATIENCE_S)
     say(event="ready")
     order = read_order()
     window = Window(order["start_ns"], order["begin_ns"], order["end_ns"])
     exchange.start(window)
     time.sleep(max(order["drained_ns"] - time.monotonic_ns(), 0) / 1e9)
-    tallies = exchange.tallies.items()
-    streams_of = {name: {**asdict(tally), "ages_s": list(tally.ages_s.values())} for name, tally in tallies}
+    streams_of = {name: asdict(tally) for name, tally in exchange.tallies.items()}
     say(streams=streams_of, refusals=dict(Counter(exchange.refusals)))
     sys.stdout.flush()
     os._exit(0)  # a publisher may still wait; nothing of it is to be kept
@@ -87,12 +69,6 @@ def tcp_read(settings: Settings) -> None:
                 pass
 
 
-_ROLES: Final[Mapping[str, Callable[[Settings], None]]] = {
-    "robot": lambda settings: traffic(settings, "up"),
-    "cloud": lambda settings: traffic(settings, "down"),
-    "tcp-send": tcp_send,
-    "tcp-read": tcp_read,
-}
-
 if __name__ == "__main__":
-    _ROLES[sys.argv[1]](json.loads(sys.argv[2]))
+    robot, cloud = (partial(traffic, direction=direction) for direction in ("up", "down"))
+    run_role({"robot": robot, "cloud": cloud, "tcp-send": tcp_send, "tcp-read": tcp_read})

@@ -24,7 +24,6 @@ from messages import CPU, MEDIAN, case_of, targets_of
 from peers.certificates import make_certificates
 from peers.chain import NODES, address, routes
 from peers.exchange import ANSWER, IMAGE, SIZE_MIN, answer_to, exchange, image
-from peers.jsonl import EndSettings
 from peers.systems import cyclone_xml
 from report import Rounds
 
@@ -170,12 +169,6 @@ def test_a_certificate_holds_for_the_addresses_of_its_machine_only(tmp_path: Pat
     own.verify_directly_issued_by(root)
     key = load_pem_private_key((tmp_path / "tls" / "s1.key").read_bytes(), None)
     assert key.public_key() == own.public_key()
-
-
-def test_settings_of_an_end_survive_the_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = EndSettings("ping", SIZE, COUNT, {"receiver": [7]}, {"config": "x"})
-    monkeypatch.setattr(sys, "argv", ["end", settings.to_argument()])
-    assert EndSettings.from_argument() == settings
 
 
 def test_a_ratio_is_taken_within_one_round_and_one_case() -> None:

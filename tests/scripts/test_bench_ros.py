@@ -66,7 +66,6 @@ def test_targets_are_compared_with_the_results_of_the_rounds(options: Options) -
     assert targets
     assert [target.what for target in targets if target.measured is None] == []
     assert all(target.met for target in targets if target.target is not None)
-    assert all(panel.bars for panel in ros.panels_of(over))
 
 
 def test_the_steps_of_a_trace_add_up_to_its_whole_time() -> None:

@@ -29,7 +29,7 @@ def over(who: str, value: float) -> Rounds:
 def outcome(value: float) -> Outcome:
     rounds = over("flow", value)
     target = rounds.target("silence, s", "flow", "case", "s", 1.0, at_most=True)
-    return Outcome("survive", "Survive", rounds, [target], {}, is_whole=False)
+    return Outcome("survive", "Survive", rounds, [target], {})
 
 
 def test_rows_of_an_earlier_record_stay_where_the_bench_keeps_them(tmp_path: Path) -> None:

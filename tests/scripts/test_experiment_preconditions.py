@@ -141,7 +141,7 @@ def test_a_bench_on_a_busy_machine_writes_no_record_but_marks_rows_where_that_is
         def measure(options: object) -> Outcome:
             over = Rounds()
             over.add("bridge", "case", "s", 1.0)
-            return Outcome("bench", "Bench", over, [], {}, is_whole=is_whole)
+            return Outcome("bench", "Bench", over, [], {})
 
         parser = command_line("", quick={"rounds": 1}, has_record=True)
         parser.set_defaults(is_whole=lambda _: is_whole)

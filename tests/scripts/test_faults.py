@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from faults.accounts import Books, Timeline
 from faults.plan import VICTIM, Flow, Oracle, Plan, Service, random_network
-from faults.records import Kind, Record, RecordReader, RecordWriter
+from faults.records import Kind, Record, RecordReader
 from faults.schedule import STRUCTURAL, make_schedule
 from faults.store import critical_lines, snapshot_faults
 
@@ -234,7 +234,7 @@ def test_a_call_without_an_answer_or_with_two_is_found() -> None:
         plan = square(services=(Service("/s", ("R",), ("P",)),))
         found = Books(plan)
         found.take("P", 1, (Record(kind, 1, 1, 0, 1, 0) for kind in kinds))
-        return found.miscalled(SECOND_NS, lambda *_: False)
+        return found.miscalled(SECOND_NS, lambda *_: True)
 
     assert not of(Kind.CALLED, Kind.ANSWERED)
     assert not of(Kind.CALLED, Kind.FAILED)
@@ -244,11 +244,11 @@ def test_a_call_without_an_answer_or_with_two_is_found() -> None:
 
 
 def test_records_come_back_as_they_were_written_also_from_a_file_that_grows(tmp_path: Path) -> None:
-    writer, reader = RecordWriter(tmp_path / "records"), RecordReader(tmp_path / "records")
+    path = tmp_path / "records"
+    reader = RecordReader(path)
     one, other = (Record(Kind.DELIVERED, 1, 2, 3, number, 5) for number in (4, 1 << 40))
-    writer.add(Kind(one.kind), *one[1:])
-    writer.flush()
+    assert list(reader.read()) == []
+    path.write_bytes(one.to_bytes() + other.to_bytes()[:9])
     assert list(reader.read()) == [one]
-    writer.add(Kind(other.kind), *other[1:])
-    writer.flush()
+    path.write_bytes(one.to_bytes() + other.to_bytes())
     assert list(reader.read()) == [other]

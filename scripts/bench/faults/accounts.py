@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -41,9 +41,9 @@ class Silence(NamedTuple):
 
 @dataclass(slots=True)
 class Account:
-    """Messages of one incarnation of a publisher at one of a reader; ``counts``: deliveries by number, up to 255."""
+    """Messages of one incarnation of a publisher at one of a reader; ``first``: the number that came first."""
 
-    counts: bytearray = field(default_factory=bytearray)
+    numbers: set[int] = field(default_factory=set)
     first: int = 0
     last: int = 0
     doubled: int = 0
@@ -51,18 +51,14 @@ class Account:
     def add(self, number: int) -> None:
         """Record a message."""
         self.first = self.first or number
-        if number >= len(self.counts):
-            self.counts.extend(bytes(number + 1 - len(self.counts) + 4_096))
-        if self.counts[number]:
-            self.doubled += 1
-        self.counts[number] = min(self.counts[number] + 1, 255)
         self.last = max(self.last, number)
+        self.doubled += number in self.numbers
+        self.numbers.add(number)
 
     def missing(self, until: int) -> int:
         """Return how many numbers did not arrive, from the first that did up to one."""
-        if not self.first:
-            return 0
-        return max(until + 1 - self.first, 0) - sum(map(bool, self.counts[self.first : until + 1]))
+        came = sum(self.first <= number <= until for number in self.numbers)
+        return max(until + 1 - self.first, 0) - came if self.first else 0
 
 
 class Timeline:
@@ -91,18 +87,14 @@ class Books:
         self._plan = plan
         # by channel, reader, the reader's incarnation, the publisher's incarnation
         self.accounts: defaultdict[tuple[int, str, int, int], Account] = defaultdict(Account)
-        self.reported_losses: defaultdict[tuple[int, str, int], int] = defaultdict(
-            int
-        )  # by channel, reader, its incarnation
-        self.reported_between: defaultdict[tuple[int, str, int], int] = defaultdict(
-            int
-        )  # the same, of before that incarnation
+        # by channel, reader, its incarnation; and the same, of before that incarnation
+        self.reported_losses: defaultdict[tuple[int, str, int], int] = defaultdict(int)
+        self.reported_between: defaultdict[tuple[int, str, int], int] = defaultdict(int)
         self.published: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # channel, incarnation -> moments
         self.arrivals_ns: defaultdict[tuple[int, str], list[int]] = defaultdict(list)
         self.wrong: list[str] = []
-        self._calls: dict[
-            tuple[int, str, int, int], list[int]
-        ] = {}  # channel, client, incarnation, number -> [since, answers]
+        # channel, client, incarnation, number -> [since, answers]
+        self._calls: dict[tuple[int, str, int, int], list[int]] = {}
         self.answered: list[tuple[int, int]] = []  # time of the call, time of the answer
         self.failed: list[tuple[int, int]] = []
 
@@ -112,8 +104,7 @@ class Books:
             if each.kind == Kind.DELIVERED:
                 self.accounts[each.channel, member, incarnation_id, each.incarnation_id].add(each.number)
                 self.arrivals_ns[each.channel, member].append(each.at_ns)
-                expected = self._plan.members.index(self._publisher(each.channel))
-                if each.other != expected:
+                if each.other != self._plan.members.index(self._plan.flows[each.channel].publisher):
                     self.wrong.append(f"{member} had a message of member {each.other} on channel {each.channel}")
             elif each.kind == Kind.PUBLISHED:
                 self.published[each.channel, incarnation_id].append(each.at_ns)
@@ -133,9 +124,6 @@ class Books:
             call[1] += 1
             (self.answered if each.kind == Kind.ANSWERED else self.failed).append((call[0], each.at_ns))
 
-    def _publisher(self, channel: int) -> str:
-        return [*self._plan.flows, *self._plan.spare][channel].publisher
-
     def silences(
         self, channel: int, reader: str, begin_ns: int, end_ns: int, must: Timeline, above_s: float
     ) -> Iterator[Silence]:
@@ -153,85 +141,67 @@ class Books:
         ``is_last_life``: whether an incarnation of a member continues to the end of the run. ``until_ns``: messages
         that were published later may still be in flight.
         """
-        found = []
-        of_reader: defaultdict[tuple[int, str, int], list[tuple[int, Account]]] = defaultdict(list)
-        for (channel, reader, incarnation_id, source_incarnation), account in sorted(self.accounts.items()):
-            of_reader[channel, reader, incarnation_id].append((source_incarnation, account))
-        for (channel, reader, incarnation_id), accounts in of_reader.items():
-            flow = self._plan.flows[channel]
-            who = f"{flow.topic} at {reader} (life {incarnation_id})"
-            if doubled := sum(account.doubled for _, account in accounts):
-                found.append(f"{who}: {doubled} messages came twice")
-            if not flow.reliable:
-                continue
-            least = most = 0
-            for at, (source_incarnation, account) in enumerate(accounts):
-                sent = sum(at_ns <= until_ns for at_ns in self.published[channel, source_incarnation])
-                is_last = is_last_life(flow.publisher, source_incarnation) and is_last_life(reader, incarnation_id)
-                # losses of a later incarnation count from its start, also if only an earlier reader knew an older one
-                is_later = at or self._known_before(channel, reader, incarnation_id, source_incarnation)
-                head = account.first - 1 if is_later else 0
-                least += account.missing(sent if is_last else account.last)
-                most += account.missing(max(sent, account.last)) + head
-            between = self._between(channel, reader, incarnation_id)
-            gap = sum(
-                self._gap(channel, reader, incarnation_id, source_incarnation) for source_incarnation, _ in accounts
-            )
-            tail = self._tail(channel, reader, incarnation_id)
-            if between and not gap <= between <= gap + tail + math.ceil(flow.hz * UNCONFIRMED_S):
-                found.append(f"{who}: {gap} messages missing since its former life, {between} reported")
-            reported_losses = self.reported_losses[channel, reader, incarnation_id]
-            if not least <= reported_losses <= most:
-                lack = f"{least}" if least == most else f"{least} to {most}"
-                found.append(f"{who}: {lack} messages missing, {reported_losses} reported")
-        return found
-
-    def _between(self, channel: int, reader: str, incarnation_id: int) -> int:
-        """Return the reported losses since the former incarnation of a reader that got a message.
-
-        Those in between got none, but may have learnt of losses.
-        """
-        reached = {life for of, who, life, _ in self.accounts if (of, who) == (channel, reader)}
-        former = max((life for life in reached if life < incarnation_id), default=incarnation_id - 1)
-        reported = self.reported_between[channel, reader, incarnation_id]
-        for life in range(former + 1, incarnation_id):
-            reported += self.reported_between[channel, reader, life] + self.reported_losses[channel, reader, life]
-        return reported
-
-    def _gap(self, channel: int, reader: str, incarnation_id: int, source_incarnation: int) -> int:
-        """Return how many messages in between reached neither this incarnation of a reader nor an earlier one."""
-        before = [
-            account.last
-            for (of, who, earlier, source), account in self.accounts.items()
-            if (of, who, source) == (channel, reader, source_incarnation) and earlier < incarnation_id
+        lives: defaultdict[tuple[int, str], defaultdict[int, dict[int, Account]]]
+        lives = defaultdict(lambda: defaultdict(dict))
+        for channel, reader, life in (*self.reported_losses, *self.reported_between):
+            lives[channel, reader][life] = {}
+        for (channel, reader, life, source), account in sorted(self.accounts.items()):
+            lives[channel, reader][life][source] = account
+        return [
+            f"{self._plan.flows[channel].topic} at {reader} (life {life}): {what}"
+            for (channel, reader), each in lives.items()
+            for life, what in self._incomplete(channel, reader, each, is_last_life, until_ns)
         ]
-        account = self.accounts[channel, reader, incarnation_id, source_incarnation]
-        return max(account.first - 1 - max(before), 0) if before else 0
 
-    def _known_before(self, channel: int, reader: str, incarnation_id: int, source_incarnation: int) -> dict[int, int]:
-        """Return the last number of earlier publisher incarnations that earlier incarnations of a reader received."""
-        known: dict[int, int] = {}
-        for (of, who, earlier, source), account in self.accounts.items():
-            if (of, who) == (channel, reader) and earlier < incarnation_id and source < source_incarnation:
-                known[source] = max(known.get(source, 0), account.last)
-        return known
+    def _incomplete(
+        self,
+        channel: int,
+        reader: str,
+        lives: Mapping[int, Mapping[int, Account]],
+        is_last_life: Callable[[str, int], bool],
+        until_ns: int,
+    ) -> Iterator[tuple[int, str]]:
+        """Yield each incarnation of a reader, and what it lacks; ``lives``: its accounts by publisher's incarnation."""
+        flow, between = self._plan.flows[channel], 0
+        known = dict[int, int]()  # the last number that earlier incarnations of the reader had, by publisher's
+        for life, accounts in sorted(lives.items()):
+            reported = self.reported_losses[channel, reader, life]
+            # one that got no message may have learnt of losses since the last one that did
+            between = (between if known else 0) + self.reported_between[channel, reader, life]
+            if not accounts:
+                between += reported
+                continue
+            if doubled := sum(account.doubled for account in accounts.values()):
+                yield life, f"{doubled} messages came twice"
+            least = most = gap = 0
+            for source, account in accounts.items():
+                sent = sum(at_ns <= until_ns for at_ns in self.published[channel, source])
+                is_last = is_last_life(flow.publisher, source) and is_last_life(reader, life)
+                # losses of a later incarnation count from its start, also if only an earlier reader knew an older one
+                is_later = any(other < source for other in (*accounts, *known))
+                least += account.missing(sent if is_last else account.last)
+                most += account.missing(max(sent, account.last)) + (account.first - 1 if is_later else 0)
+                gap += max(account.first - 1 - known.get(source, account.first), 0)
+            # what publishers sent after the reader had last received from them, and died
+            gone = {source: last for source, last in known.items() if source < max(accounts) and source not in accounts}
+            tail = sum(max(len(self.published[channel, source]) - last, 0) for source, last in gone.items())
+            if flow.reliable and between and not gap <= between <= gap + tail + math.ceil(flow.hz * UNCONFIRMED_S):
+                yield life, f"{gap} messages missing since its former life, {between} reported"
+            if flow.reliable and not least <= reported <= most:
+                lack = f"{least}" if least == most else f"{least} to {most}"
+                yield life, f"{lack} messages missing, {reported} reported"
+            known |= {source: max(known.get(source, 0), account.last) for source, account in accounts.items()}
+            between = 0
 
-    def _tail(self, channel: int, reader: str, incarnation_id: int) -> int:
-        """Return what publisher incarnations sent after a reader's former ones last received from them, and died."""
-        own = {source for of, who, its, source in self.accounts if (of, who, its) == (channel, reader, incarnation_id)}
-        known = self._known_before(channel, reader, incarnation_id, max(own))
-        lost = (len(self.published[channel, source]) - last for source, last in known.items() if source not in own)
-        return sum(max(each, 0) for each in lost)
-
-    def miscalled(self, until_ns: int, is_over: Callable[[str, int], bool]) -> list[str]:
+    def miscalled(self, until_ns: int, is_last_life: Callable[[str, int], bool]) -> list[str]:
         """Return the calls without a result, or with more than one.
 
-        ``until_ns``: calls that began later may still be in progress. ``is_over``: whether an incarnation of a member
-        ended before its calls did.
+        ``until_ns``: calls that began later may still be in progress. ``is_last_life``: as in ``incomplete``; the calls
+        of an earlier incarnation ended with it.
         """
         found = []
         for (channel, client, incarnation_id, number), (since_ns, ends) in self._calls.items():
-            if ends > 1 or (not ends and since_ns < until_ns and not is_over(client, incarnation_id)):
+            if ends > 1 or (not ends and since_ns < until_ns and is_last_life(client, incarnation_id)):
                 found.append(f"call {number} of {client} on channel {channel}: {ends} answers")
         return found
 

@@ -24,17 +24,16 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from pathlib import Path
 from typing import Final
 
 from pyroute2 import IPRoute
 
 from gdp.closing import ClosedOnExit
 from gdp.frame.codec import ETHERTYPE
-from gdp.host import netns_files
 from gdp.ports.kernel.assembler import Assembler, Reg
 from gdp.ports.kernel.syscall import Command, bpf, load_program
 from gdp.ports.sockets import large_buffers
+from lab.namespaces import Namespaces
 
 _TCX_INGRESS: Final = 46
 _BEFORE: Final = 1 << 3  # BPF_F_BEFORE, with no program named: before all
@@ -59,35 +58,33 @@ class FrameFaults:
 
 
 class LinkFaults(ClosedOnExit):
-    """The faults of many devices; a context manager that ends them all."""
+    """The faults of the links between these namespaces; a context manager that ends them all."""
 
-    def __init__(self) -> None:
-        self._detours: dict[tuple[Path, str], _Detour] = {}
+    def __init__(self, spaces: Namespaces) -> None:
+        self._spaces = spaces
+        self._detours: dict[tuple[str, str], _Detour] = {}
         self._numbers = count()
 
-    def set(self, namespace: Path, ifname: str, faults: FrameFaults) -> None:
-        """Apply faults to frames that a device receives, from now on.
+    def set(self, a: str, b: str, faults: FrameFaults) -> None:
+        """Apply faults to the frames of a link, both ways, from now on. Raises ``LocalError``: the kernel refuses."""
+        for own, other in ((a, b), (b, a)):
+            if detour := self._detours.get((own, other)):
+                detour.faults = faults
+            else:
+                made = self._spaces[own].inside(partial(_Detour, other, next(self._numbers), faults))
+                self._detours[own, other] = made
 
-        Raises ``LocalError``: the kernel refuses. Raises ``OSError``: no such namespace.
-        """
-        detour = self._detours.get((namespace, ifname))
-        if detour is None:
-            made = netns_files.inside(namespace, partial(_Detour, ifname, next(self._numbers), faults))
-            self._detours[namespace, ifname] = made
-        else:
-            detour.faults = faults
-
-    def clear(self, namespace: Path, ifname: str) -> None:
-        """Remove the faults of a device; harmless where it has none. Frames that are delayed are lost."""
-        detour = self._detours.pop((namespace, ifname), None)
-        if detour is not None:
-            netns_files.inside(namespace, detour.close)
+    def clear(self, a: str, b: str) -> None:
+        """Remove the faults of a link; harmless where it has none. Frames that are delayed are lost."""
+        for own, other in ((a, b), (b, a)):
+            if detour := self._detours.pop((own, other), None):
+                self._spaces[own].inside(detour.close)
 
     def close(self) -> None:
         """Remove all faults."""
-        for namespace, ifname in list(self._detours):
+        for ends in list(self._detours):
             with contextlib.suppress(OSError):  # the namespace was removed first, with its devices
-                self.clear(namespace, ifname)
+                self.clear(*ends)
 
 
 class _Detour:

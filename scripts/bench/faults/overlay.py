@@ -10,7 +10,9 @@ import json
 import signal
 import struct
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -20,8 +22,9 @@ from report import progress
 from faults.accounts import Books
 from faults.clock import Clock
 from faults.link_faults import FrameFaults, LinkFaults
-from faults.plan import Flow, Plan, Service
+from faults.plan import Plan, Service
 from faults.records import Record, RecordReader
+from faults.schedule import KILLS
 from faults.store import Disk, StoreCluster
 from gdp.closing import ClosedOnExit
 from gdp.crypto.certificates import Role
@@ -30,18 +33,16 @@ from gdp.host.run_registry import Run
 from gdp.journal.incident import Incident
 from gdp.management.control_client import NodeConnection, find_control_socket
 from gdp.metadata import Metadata
-from gdp.stores.keyring import load_domain, load_identity
-from gdp.trust.revocation import Revocation
+from gdp.stores.keyring import NODE_CERTIFICATE
 from gdp.trust.right import Right
 from lab.credentials import OverlayCredentials
 from lab.faults import STORE, Fault, FaultKind, links_of
+from lab.machine import gdp
 from lab.machines import Lab
-from lab.namespaces import received
 from lab.process import FailedError, LabProcess, end_processes, until
 
 READY_S: Final = 60.0
 LOOK_S: Final = 0.1
-KILLS: Final = frozenset({FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER})
 FRAMES: Final = {
     FaultKind.SILENT: FrameFaults(lost=1.0),
     FaultKind.LOSS: FrameFaults(lost=0.05),
@@ -66,9 +67,11 @@ class Overlay(ClosedOnExit):
 
     Attributes:
         processes: what was started and not killed; it may have ended by itself.
-        incarnation_ids: how often each process was started.
+        lives: every process that was started, by name.
+        active: faults that have begun and not ended.
         at: the switch that each member, or switch that moves, is plugged into.
         spaces: the namespaces, in which links can be cut.
+        links: the frames of links, which can be disturbed.
         books: what the members have recorded, as far as ``watch`` has read it.
 
     Raises:
@@ -94,10 +97,10 @@ class Overlay(ClosedOnExit):
         journal = {"journal": JOURNAL_MIB} if has_journals else {}
         self._more = {role: {**journal, **(more or {}).get(role, {})} for role in ("switch", "rib")}
         self.at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
-        self.incarnation_ids: dict[str, int] = {}
+        self.lives: defaultdict[str, list[LabProcess]] = defaultdict(list)
         self.processes: dict[str, LabProcess] = {}
-        self._frozen: set[str] = set()
-        self._records: dict[tuple[str, int], RecordReader] = {}
+        self.active: list[Fault] = []
+        self._records: defaultdict[str, list[RecordReader]] = defaultdict(list)
         self.spaces = self._lab.namespaces
         self.books = Books(plan)
         self._credentials = OverlayCredentials(plan.topology, run.directory)
@@ -105,7 +108,7 @@ class Overlay(ClosedOnExit):
         if has_clocks:
             (run.directory / "clocks").mkdir()
             self._clocks = {who: Clock(run.directory / "clocks" / who.replace(" ", "-")) for who in self.everybody()}
-        self._links = LinkFaults()
+        self.links = LinkFaults(self.spaces)
         self.disk = Disk(run) if has_disk else None
         self.store = StoreCluster(run, self.spaces, in_store) if in_store else None
         self._in_store = frozenset(in_store)
@@ -114,10 +117,10 @@ class Overlay(ClosedOnExit):
 
     def close(self) -> None:
         """End all processes, and remove the faults."""
-        self._links.close()
+        self.links.close()
         if self.store is not None:
             self.store.close()
-        for who in list(self._frozen):
+        for who in self.processes:
             self.thaw(who)
         end_processes(list(self.processes.values()))  # all at once
 
@@ -133,46 +136,48 @@ class Overlay(ClosedOnExit):
 
     def begin(self, fault: Fault) -> None:
         """Make a fault happen. Raises ``FailedError``: a process that it restarts does not come up."""
-        kind, targets = fault.kind, fault.targets
-        if kind in FRAMES:
-            self.disturb(targets[0], targets[1], FRAMES[kind])
-        elif kind in KILLS:
-            self.kill(targets[0])
-        elif kind is FaultKind.FREEZE:
-            self.freeze(targets[0])
-        elif kind is FaultKind.CLOCK:
-            self.step_clock(targets[0], fault.amount)
-        elif kind is FaultKind.ROAM:
-            self.move(*targets)
-        elif kind is FaultKind.REVOKE:
-            self.revoke(targets[0])
-        elif kind is FaultKind.DISK_FULL and self.disk is not None:
-            self.disk.fill()
-            for rib in targets[1:]:
-                self.kill(rib)
-                self.restart(rib)
-        elif self.store is not None and targets[0] == STORE:
-            progress(f"           {self.store.take(fault)}")
+        self.active.append(fault)
+        self._changes(fault)[0]()
         for link in links_of(fault):
             self.spaces.cut(*link)
 
     def end(self, fault: Fault) -> None:
         """Undo a fault that can be undone; a killed process is ready then. Raises as ``begin``."""
-        kind, targets = fault.kind, fault.targets
-        if kind in FRAMES:
-            self.calm(*targets)
-        elif kind in KILLS:
-            self.restart(targets[0])
-        elif kind is FaultKind.FREEZE:
-            self.thaw(targets[0])
-        elif kind is FaultKind.CLOCK:
-            self.step_clock(targets[0], 0.0)
-        elif kind is FaultKind.DISK_FULL and self.disk is not None:
-            self.disk.free()
-        elif self.store is not None and targets[0] == STORE:
-            self.store.give_back(fault)
+        self.active.remove(fault)
+        self._changes(fault)[1]()
         for link in links_of(fault):
             self.spaces.restore_link(*link)
+
+    def _changes(self, fault: Fault) -> tuple[Callable[[], object], Callable[[], object]]:
+        """Return what makes a fault and what undoes it, but for links that lose their carrier."""
+        kind, targets = fault.kind, fault.targets
+        if kind in FRAMES:
+            a, b = targets
+            return partial(self.links.set, a, b, FRAMES[kind]), partial(self.links.clear, a, b)
+        if kind in KILLS:
+            return partial(self.kill, targets[0]), partial(self.restart, targets[0])
+        if kind is FaultKind.FREEZE:
+            return partial(self.freeze, targets[0]), partial(self.thaw, targets[0])
+        if kind is FaultKind.CLOCK:
+            step = self._clocks[targets[0]].step
+            return partial(step, fault.amount), partial(step, 0.0)
+        if kind is FaultKind.ROAM:
+            return partial(self.move, *targets), _nothing
+        if kind is FaultKind.REVOKE:
+            return partial(self.revoke, targets[0]), _nothing
+        if kind is FaultKind.DISK_FULL and self.disk is not None:
+            return partial(self._fill, self.disk, targets[1:]), self.disk.free
+        if self.store is not None and targets[0] == STORE:
+            store = self.store
+            return lambda: progress(f"           {store.take(fault)}"), partial(store.give_back, fault)
+        return _nothing, _nothing
+
+    def _fill(self, disk: Disk, ribs: Sequence[str]) -> None:
+        """Fill the disk, and start RIBs again while it is full."""
+        disk.fill()
+        for rib in ribs:
+            self.kill(rib)
+            self.restart(rib)
 
     # processes
 
@@ -188,16 +193,19 @@ class Overlay(ClosedOnExit):
     def start(self, who: str) -> None:
         """Start a process, also one that was killed, with a new incarnation; does not wait for it."""
         role, _, node = who.partition(" ")
-        incarnation_id = self.incarnation_ids[who] = self.incarnation_ids.get(who, 0) + 1
+        incarnation_id = len(self.lives[who]) + 1
         if role == "switch":
             argv = ["gdp.cli.switch", "--json", "--config", str(self._switch_file(node))]
         elif role == "rib":
             argv = ["gdp.cli.rib", "--json", "--config", str(self._rib_file(node))]
         else:
-            argv = ["faults.member", json.dumps(self._settings(node, incarnation_id))]
+            records = self.directory / f"{node}-{incarnation_id}.records"
+            self._records[node].append(RecordReader(records))
+            argv = ["faults.member", json.dumps(self._settings(node, incarnation_id, records))]
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
         self.processes[who] = self._lab.start(node, f"{role}-{incarnation_id}", argv)
+        self.lives[who].append(self.processes[who])
 
     def restart(self, *names: str) -> None:
         """Start processes, and read records until each is ready: it joins the network then."""
@@ -208,7 +216,6 @@ class Overlay(ClosedOnExit):
 
     def kill(self, who: str) -> None:
         """Kill a process at once (SIGKILL)."""
-        self._frozen.discard(who)
         self.processes.pop(who).kill_group()
 
     def died(self) -> list[str]:
@@ -217,25 +224,16 @@ class Overlay(ClosedOnExit):
 
     def freeze(self, who: str) -> None:
         """Stop a process (SIGSTOP)."""
-        self._frozen.add(who)
         self.processes[who].send(signal.SIGSTOP)
 
     def thaw(self, who: str) -> None:
-        """Continue a frozen process; harmless when it is not frozen."""
-        if who in self._frozen and who in self.processes:
-            self._frozen.discard(who)
+        """Continue a frozen process; harmless when it is not frozen, or was killed."""
+        if who in self.processes:
             self.processes[who].send(signal.SIGCONT)
-
-    def step_clock(self, who: str, seconds: float) -> None:
-        """Set a process's wall clock off the machine's by so many seconds."""
-        self._clocks[who].step(seconds)
 
     def read(self, member: str) -> Iterator[tuple[int, Iterator[Record]]]:
         """Yield, by incarnation, what a member recorded since the last call."""
-        for incarnation_id in range(1, self.incarnation_ids.get(f"member {member}", 0) + 1):
-            if (member, incarnation_id) not in self._records:
-                self._records[member, incarnation_id] = RecordReader(self._record_file(member, incarnation_id))
-            yield incarnation_id, self._records[member, incarnation_id].read()
+        yield from ((number, records.read()) for number, records in enumerate(self._records[member], 1))
 
     def watch(self, seconds: float, *, is_strict: bool = False) -> None:
         """Read into the books what members record, for so long.
@@ -245,7 +243,7 @@ class Overlay(ClosedOnExit):
         end_s = time.monotonic() + seconds
         while True:
             for who in self.died() if is_strict else ():
-                raise FailedError(f"{who} ended by itself: {self.log_tail(who)}")
+                raise self.processes[who].failed("ended by itself")
             for member in self.plan.members:
                 for incarnation_id, records in self.read(member):
                     self.books.take(member, incarnation_id, records)
@@ -255,21 +253,13 @@ class Overlay(ClosedOnExit):
                 return
             time.sleep(min(LOOK_S, left_s))
 
-    def log_tail(self, who: str, lines: int = 15) -> str:
-        """Return the end of a process's log, of its latest incarnation."""
-        texts = [text for _, text in self.logs(who)]
-        return "\n".join(texts[-1].splitlines()[-lines:]) if texts else ""
-
     def keeps_snapshot(self, node: str) -> bool:
         """Return whether the RIB at a switch keeps a snapshot on the disk."""
         return self.disk is not None and node not in self._in_store
 
     def logs(self, who: str) -> Iterator[tuple[int, str]]:
         """Yield each incarnation of a process, and its whole log."""
-        for incarnation_id in range(1, self.incarnation_ids.get(who, 0) + 1):
-            role, _, node = who.partition(" ")
-            path = self.directory / f"{role}-{incarnation_id}-{node}.log"
-            yield incarnation_id, path.read_text(encoding="utf-8", errors="replace")
+        yield from ((number, process.logged) for number, process in enumerate(self.lives[who], 1))
 
     def save_journals(self, folder: Path) -> None:
         """Write the incident of each switch and RIB that runs; not sealed, because the keys of a run end with it."""
@@ -291,25 +281,17 @@ class Overlay(ClosedOnExit):
 
     def revoke(self, member: str) -> None:
         """Revoke a member's membership: each switch receives the statement."""
-        label = self.plan.topology.domain_of(member).label
-        authority = load_domain(self.directory / "domains" / label)
-        identity = load_identity(self.directory / "nodes" / f"proxy-{member}", time.time())
-        held = identity.member
-        wire = Revocation.make(authority.key, authority.root.subject, held.fingerprint, held.not_after_unix_s)
-        (self.directory / "revocations" / f"{member}.revoke").write_bytes(wire)
+        gdp(*self.revocation(member))
         for node in self.plan.switches:
             if f"switch {node}" in self.processes:
                 self.processes[f"switch {node}"].send(signal.SIGHUP)
 
-    def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
-        """Apply faults to the frames of a link, both ways."""
-        for own, other in ((a, b), (b, a)):
-            self._links.set(self.spaces[own].path, other, faults)
-
-    def calm(self, a: str, b: str) -> None:
-        """Remove the faults of a link."""
-        for own, other in ((a, b), (b, a)):
-            self._links.clear(self.spaces[own].path, other)
+    def revocation(self, member: str) -> list[str]:
+        """Return the words of ``gdp`` that revoke a membership, into a file that switches read at the next SIGHUP."""
+        certificate = self._credentials.identity(Role.PROXY, member) / NODE_CERTIFICATE
+        domain = self._credentials.domain(self.plan.topology.domain_of(member).label)
+        out = self.directory / "revocations" / f"{member}.revoke"
+        return ["cert", "revoke", str(certificate), "--domain", str(domain), "--out", str(out)]
 
     def make_thin(self, a: str, b: str, bits_s: float, fifo_s: float) -> None:
         """Give a link a rate and a plain FIFO, both ways, to the end of the run."""
@@ -317,10 +299,6 @@ class Overlay(ClosedOnExit):
         shape = f"tbf rate {bits_s:.0f}bit burst {_BUCKET_BYTES} limit {limit}"  # before the bucket, frames wait
         for own, other in ((a, b), (b, a)):
             self.spaces[own].run("tc", "qdisc", "add", "dev", other, "root", *shape.split())
-
-    def received(self, node: str, neighbours: Sequence[str]) -> dict[str, int]:
-        """Return how many frames have come in at a node's devices towards these neighbours."""
-        return self._lab.inside(node, partial(received, neighbours))
 
     def move(self, mover: str, to: str) -> None:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
@@ -356,40 +334,27 @@ class Overlay(ClosedOnExit):
         switches = [at for at in self.plan.ribs if self.plan.topology.domain_of(at).label == label and at != but]
         return [self._credentials.name(Role.RIB, at).to_text() for at in switches]
 
-    def _settings(self, member: str, incarnation_id: int) -> dict[str, object]:
-        """Return the settings of a member process: its identity, and its flows and services."""
-        parts = ("publish", "read", "serve", "call", "spare")
-        settings: dict[str, list[dict[str, object]]] = {part: [] for part in parts}
-        for channel, what in self.plan.channels(member):
-            if isinstance(what, Service):
-                part = {"channel": channel, "name": what.name, "hz": what.hz, "timeout_s": what.timeout_s}
-                settings["serve" if member in what.servers else "call"].append(part)
-            else:
-                settings["publish" if member == what.publisher else "read"].append(_flow_part(channel, what))
-        for channel, flow in self.plan.spares(member):
-            settings["spare"].append({**_flow_part(channel, flow), "publishes": member == flow.publisher})
+    def _settings(self, member: str, incarnation_id: int, records: Path) -> dict[str, object]:
+        """Return the settings of a member process: its identity, and its flows and services.
+
+        The token of a channel begins each of its messages, and no other channel's.
+        """
+        run = struct.pack("!I", int(self._run.id, 16))
         return {
             "config": str(self.directory / f"end-{member}.yaml"),
-            "records": str(self._record_file(member, incarnation_id)),
+            "records": str(records),
+            "member": member,
             "index": self.plan.members.index(member),
             "incarnation_id": incarnation_id,
-            "tokens": {channel: self._token(channel).hex() for channel, _ in self._parts(member)},
-            **settings,
+            "channels": [
+                {**asdict(what), "channel": channel, "token": (run + struct.pack("!I", channel)).hex()}
+                for channel, what in self.plan.channels(member)
+            ],
         }
-
-    def _record_file(self, member: str, incarnation_id: int) -> Path:
-        return self.directory / f"{member}-{incarnation_id}.records"
-
-    def _parts(self, member: str) -> list[tuple[int, Flow | Service]]:
-        return [*self.plan.channels(member), *self.plan.spares(member)]
-
-    def _token(self, channel: int) -> bytes:
-        """Return the prefix of every message of a channel, which no other channel has."""
-        return struct.pack("!I", int(self._run.id, 16)) + struct.pack("!I", channel)
 
     def _admit(self, member: str) -> None:
         """Give a member its delegations, and write its configuration."""
-        for _, what in self._parts(member):
+        for _, what in self.plan.channels(member):
             if isinstance(what, Service):
                 right = Right.SERVE if member in what.servers else Right.CALL
                 metadata = Metadata({"kind": "service", "name": what.name})
@@ -403,5 +368,5 @@ class Overlay(ClosedOnExit):
         )
 
 
-def _flow_part(channel: int, flow: Flow) -> dict[str, object]:
-    return {"channel": channel, "name": flow.topic, "hz": flow.hz, "reliable": flow.reliable, "size": flow.size}
+def _nothing() -> None:
+    """Neither make nor undo anything."""

@@ -21,7 +21,11 @@ from lab.topology import Link, Topology, make_topology
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """Topic with one publisher; ``size``: bytes of each message."""
+    """Topic with one publisher.
+
+    ``size``: bytes of each message. ``waits``: it begins when publisher and readers get a signal, which starts the
+    first flow that still waits.
+    """
 
     topic: str
     publisher: str
@@ -29,6 +33,11 @@ class Flow:
     reliable: bool = True
     hz: float = 20.0
     size: int = 100
+    waits: bool = False
+
+    def has(self, member: str) -> bool:
+        """Return whether a member takes part."""
+        return member == self.publisher or member in self.readers
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +50,10 @@ class Service:
     hz: float = 5.0
     timeout_s: float = 5.0
 
+    def has(self, member: str) -> bool:
+        """Return whether a member takes part."""
+        return member in self.servers or member in self.clients
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -50,8 +63,7 @@ class Plan:
         topology: members are nodes of it, too.
         members: those nodes that run no switch.
         homes: of members (and switches) whose link moves: the possible switches, the first at the start.
-        flows, services: traffic between members; the index in the tuple is the channel.
-        spare: flows that begin one by one, when publisher and readers get a signal; their channels come after those.
+        flows, services: traffic between members; the index in both together is the channel.
     """
 
     topology: Topology
@@ -59,7 +71,6 @@ class Plan:
     homes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     flows: tuple[Flow, ...] = ()
     services: tuple[Service, ...] = ()
-    spare: tuple[Flow, ...] = ()
 
     @property
     def switches(self) -> tuple[str, ...]:
@@ -77,19 +88,9 @@ class Plan:
         return homes[0] if homes else self.topology.neighbours(mover)[0]
 
     def channels(self, member: str) -> Iterable[tuple[int, Flow | Service]]:
-        """Yield what a member takes part in, with its channel."""
-        for channel, flow in enumerate(self.flows):
-            if member == flow.publisher or member in flow.readers:
-                yield channel, flow
-        for channel, service in enumerate(self.services, len(self.flows)):
-            if member in service.servers or member in service.clients:
-                yield channel, service
-
-    def spares(self, member: str) -> Iterable[tuple[int, Flow]]:
-        """Yield the spare flows that a member has a part in, with their channels."""
-        for channel, flow in enumerate(self.spare, len(self.flows) + len(self.services)):
-            if member == flow.publisher or member in flow.readers:
-                yield channel, flow
+        """Return what a member takes part in, with its channel."""
+        parts: tuple[Flow | Service, ...] = (*self.flows, *self.services)
+        return [(channel, part) for channel, part in enumerate(parts) if part.has(member)]
 
 
 VICTIM: Final = "victim"  # the member whose membership is revoked
@@ -201,6 +202,7 @@ class Oracle:
         return homes[1] in self.part_of(homes[0], broken)
 
     def pairs(self) -> Iterator[tuple[int, str, str]]:
-        """Yield each flow's channel, publisher and reader."""
+        """Yield channel, publisher and reader of each flow that does not wait."""
         for channel, flow in enumerate(self._plan.flows):
-            yield from ((channel, flow.publisher, reader) for reader in flow.readers)
+            if not flow.waits:
+                yield from ((channel, flow.publisher, reader) for reader in flow.readers)

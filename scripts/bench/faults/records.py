@@ -1,11 +1,10 @@
 """Records of a member: fixed size, appended to a file, and their reader.
 
-I/O. One file. Written records remain when the writer is killed, because the kernel holds them from then on.
+I/O. One file. Flushed records remain when the writer is killed, because the kernel holds them from then on.
 """
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Iterator
 from enum import IntEnum
@@ -25,7 +24,6 @@ class Kind(IntEnum):
     CALLED = 5  # number: of the request
     ANSWERED = 6
     FAILED = 7
-    READERS = 8  # number: how many readers the publisher counts now
 
 
 class Record(NamedTuple):
@@ -38,23 +36,9 @@ class Record(NamedTuple):
     number: int
     at_ns: int
 
-
-class RecordWriter:
-    """Writer of records; ``flush`` passes them to the kernel."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
-        self._waiting: list[bytes] = []
-
-    def add(self, kind: Kind, channel: int, incarnation_id: int, other: int, number: int, at_ns: int) -> None:
-        """Add one record."""
-        self._waiting.append(_FORM.pack(kind, channel, incarnation_id, other, number, at_ns))
-
-    def flush(self) -> None:
-        """Write the pending records."""
-        if self._waiting:
-            os.write(self._file, b"".join(self._waiting))
-            self._waiting.clear()
+    def to_bytes(self) -> bytes:
+        """Return the record as ``RecordReader`` reads it."""
+        return _FORM.pack(*self)
 
 
 class RecordReader:

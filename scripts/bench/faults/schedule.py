@@ -14,6 +14,7 @@ from typing import Final
 from faults.plan import VICTIM, Oracle, Plan
 from lab.faults import STORE, Fault, FaultKind, broken_by
 
+KILLS: Final = {FaultKind.KILL_SWITCH: "switch", FaultKind.KILL_RIB: "rib", FaultKind.KILL_MEMBER: "member"}
 STRUCTURAL: Final = frozenset({FaultKind.CUT, FaultKind.SILENT, FaultKind.KILL_SWITCH})
 _WEIGHTS: Final = {
     FaultKind.CUT: 4, FaultKind.SILENT: 3, FaultKind.LOSS: 3, FaultKind.DOUBLED: 2, FaultKind.REORDERED: 2,
@@ -83,16 +84,12 @@ def _one(
     end_s = min(now_s + chance.uniform(0.5, 8.0), duration_s)
     if kind in (FaultKind.CUT, FaultKind.SILENT, FaultKind.LOSS, FaultKind.DOUBLED, FaultKind.REORDERED):
         return Fault(kind, tuple(sorted(chance.choice(oracle.links))), now_s, end_s)
-    if kind is FaultKind.KILL_SWITCH:
-        return Fault(kind, (f"switch {chance.choice(plan.switches)}",), now_s, end_s)
-    if kind is FaultKind.KILL_RIB:
-        return Fault(kind, (f"rib {chance.choice(plan.ribs)}",), now_s, end_s)
-    members = [member for member in plan.members if member != VICTIM]
-    if kind is FaultKind.KILL_MEMBER:
-        return Fault(kind, (f"member {chance.choice(members)}",), now_s, end_s)
-    if kind in (FaultKind.FREEZE, FaultKind.CLOCK):
-        role, nodes = chance.choice((("switch", plan.switches), ("rib", plan.ribs), ("member", members)))
-        who = f"{role} {chance.choice(nodes)}"
+    nodes = {"switch": plan.switches, "rib": plan.ribs, "member": [each for each in plan.members if each != VICTIM]}
+    if kind in KILLS or kind in (FaultKind.FREEZE, FaultKind.CLOCK):
+        role = KILLS.get(kind) or chance.choice(list(nodes))
+        who = f"{role} {chance.choice(nodes[role])}"
+        if kind in KILLS:
+            return Fault(kind, (who,), now_s, end_s)
         if kind is FaultKind.FREEZE:
             return Fault(kind, (who,), now_s, min(now_s + chance.uniform(0.3, 3.0), duration_s))
         return Fault(kind, (who,), now_s, end_s, chance.choice((-_CLOCK_STEP_S, _CLOCK_STEP_S)))

@@ -19,7 +19,12 @@ _HOST: Final = (
 
 
 def make_certificates(directory: Path, hosts: Mapping[str, Iterable[str]]) -> None:
-    """Write ``ca.crt`` and, for each host, ``NAME.crt`` and ``NAME.key``. ``hosts``: IPv4 addresses by name."""
+    """Write ``ca.crt`` and, for each host, ``NAME.crt`` and ``NAME.key``, unless the directory is there.
+
+    ``hosts``: IPv4 addresses by name.
+    """
+    if directory.exists():
+        return
     directory.mkdir(mode=0o700)
     _make(directory, "ca", "bench root", _ROOT)
     for host, addresses in hosts.items():

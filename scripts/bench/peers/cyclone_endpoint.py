@@ -25,8 +25,8 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-from peers.exchange import ANSWER, answer_to, exchange
-from peers.jsonl import EndSettings, say
+from peers.exchange import ANSWER, answer_to, ping
+from peers.jsonl import Settings, run_role, say
 
 _ANY: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _AT_ONCE: Final = 16
@@ -44,7 +44,8 @@ class Opaque(IdlStruct, typename="bench::Opaque"):  # type: ignore[call-arg, mis
 class CycloneWay:
     """One endpoint: writes one topic, reads the other."""
 
-    def __init__(self, writes: str, reads: str) -> None:
+    def __init__(self, writes: str, reads: str, xml: str) -> None:
+        os.environ["CYCLONEDDS_URI"] = xml  # read when the participant is made
         qos = Qos(
             Policy.Reliability.Reliable(max_blocking_time=10_000_000_000),
             Policy.History.KeepLast(10),
@@ -81,19 +82,16 @@ class CycloneWay:
         return None if message is None else message[len(_PREFIX) : len(_PREFIX) + ANSWER.size]
 
 
-def main() -> None:
-    """Run ``ping`` or ``pong``."""
-    settings = EndSettings.from_argument()
-    os.environ["CYCLONEDDS_URI"] = settings.own["xml"]  # read when the participant is made
-    if settings.role == "ping":
-        pids = {"sender": [os.getpid()], **settings.pids}
-        say(**exchange(CycloneWay("ping", "pong"), settings.size, settings.count, pids))
-        return
-    way = CycloneWay("pong", "ping")
+def _ping(settings: Settings) -> None:
+    ping(CycloneWay("ping", "pong", settings["xml"]), settings)
+
+
+def _pong(settings: Settings) -> None:
+    way = CycloneWay("pong", "ping", settings["xml"])
     say(event="ready")
     while (message := way.receive(time.monotonic() + _FOREVER_S)) is not None:
         way.send(_PREFIX + answer_to(message))
 
 
 if __name__ == "__main__":
-    main()
+    run_role({"ping": _ping, "pong": _pong})

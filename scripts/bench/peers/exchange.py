@@ -7,12 +7,10 @@ has 16 bytes: the number, the bytes that arrived, and, where the number requests
 
 CPU is the reading of the processes' own clocks over the measured messages: A's, B's, and that of all in between.
 Kernel forwarding on the way runs in the process that was interrupted, mostly the one that sent.
-Source of the clocks: clock_getcpuclockid(3).
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
 import secrets
 import struct
@@ -20,6 +18,10 @@ import time
 import zlib
 from collections.abc import Mapping, Sequence
 from typing import Final, Protocol
+
+from machine import processor_s
+
+from peers.jsonl import Settings, say
 
 IMAGE: Final = "sensor_msgs/msg/Image"
 PATIENCE_S: Final = 20.0
@@ -61,22 +63,26 @@ def answer_to(message: bytes) -> bytes:
     return ANSWER.pack(number, len(message), zlib.crc32(message) if number & _CHECKED else 0)
 
 
+def ping(way: Way, settings: Settings) -> None:
+    """Measure ``count`` messages of ``size`` bytes, and report; ``pids``: further processes by machine, as below."""
+    say(**exchange(way, settings["size"], settings["count"], {"sender": [os.getpid()], **settings["pids"]}))
+
+
 def exchange(way: Way, size: int, count: int, pids: Mapping[str, Sequence[int]]) -> dict[str, object]:
     """Measure ``count`` messages of a size; return ``rtt_s`` of every message, and ``cpu_s`` a message by machine.
 
     ``pids``: of the processes at each machine. Raises ``TimeoutError``: an answer did not come. Raises ``ValueError``:
     B received other bytes than were sent.
     """
-    clocks = {place: [_clock(pid) for pid in each] for place, each in pids.items()}
     numbers, message = iter(range(1, _CHECKED)), image(size)
     _greet(way)
     _once(way, message, next(numbers) | _CHECKED)
     for _ in range(count):  # windows open, caches fill
         _once(way, message, next(numbers))
-    before = _read(clocks)
+    before = _used_s(pids)
     rtts = [_once(way, message, next(numbers)) for _ in range(count)]
-    after = _read(clocks)
-    return {"rtt_s": rtts, "cpu_s": {place: (after[place] - before[place]) / count for place in clocks}}
+    after = _used_s(pids)
+    return {"rtt_s": rtts, "cpu_s": {place: (after[place] - before[place]) / count for place in pids}}
 
 
 def _greet(way: Way) -> None:
@@ -108,13 +114,5 @@ def _once(way: Way, image_bytes: bytearray, number: int) -> float:
     return ended_s - begun_s
 
 
-def _clock(pid: int) -> int:
-    clock = ctypes.c_int()
-    error = ctypes.CDLL(None).clock_getcpuclockid(pid, ctypes.byref(clock))
-    if error:
-        raise OSError(error, f"{os.strerror(error)}: CPU clock of process {pid}")
-    return clock.value
-
-
-def _read(clocks: Mapping[str, Sequence[int]]) -> dict[str, float]:
-    return {place: sum(map(time.clock_gettime, each)) for place, each in clocks.items()}
+def _used_s(pids: Mapping[str, Sequence[int]]) -> dict[str, float]:
+    return {place: sum(map(processor_s, each)) for place, each in pids.items()}

@@ -6,7 +6,6 @@ is all that a proxy does except for ROS.
 
 from __future__ import annotations
 
-import os
 import signal
 import time
 from collections import deque
@@ -18,8 +17,8 @@ from gdp.names import Name
 from gdp.runtime.busy_poll import SPIN_US
 from gdp.runtime.memory_tuning import tune_memory
 from lab.end import End
-from peers.exchange import PATIENCE_S, answer_to, exchange
-from peers.jsonl import EndSettings, say
+from peers.exchange import PATIENCE_S, answer_to, ping
+from peers.jsonl import Settings, run_role, say
 
 PING, PONG = "/ping", "/pong"
 _FOREVER_S: Final = 3_600.0
@@ -90,23 +89,27 @@ class SessionEndpoint:
         return self._arrived.popleft()
 
 
-def main() -> None:
-    """Run ``ping`` or ``pong``."""
-    settings = EndSettings.from_argument()
-    kind = SessionEndpoint if settings.own["sign"] == "session" else SignedEndpoint
-    end = kind(Path(settings.own["config"]), is_ping=settings.role == "ping")
+def _end(settings: Settings, *, is_ping: bool) -> SessionEndpoint | SignedEndpoint:
+    kind = SessionEndpoint if settings["sign"] == "session" else SignedEndpoint
+    end = kind(Path(settings["config"]), is_ping=is_ping)
     tune_memory()
-    if settings.role == "ping":
-        end.connect()
-        say(**exchange(end, settings.size, settings.count, {"sender": [os.getpid()], **settings.pids}))
-        return
+    return end
+
+
+def _ping(settings: Settings) -> None:
+    end = _end(settings, is_ping=True)
+    end.connect()
+    ping(end, settings)
+
+
+def _pong(settings: Settings) -> None:
+    end = _end(settings, is_ping=False)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the bench ends it so; there is nothing to release
     say(event="ready")
     while True:
-        message = end.wait(time.monotonic() + _FOREVER_S)
-        if message is not None:
+        if message := end.wait(time.monotonic() + _FOREVER_S):
             end.send(answer_to(message))
 
 
 if __name__ == "__main__":
-    main()
+    run_role({"ping": _ping, "pong": _pong})

@@ -1,4 +1,4 @@
-"""Process's side of a bench: its settings as one argument, commands to it and its replies as lines of JSON.
+"""Process's side of a bench: its role and settings as arguments, commands and replies as lines of JSON.
 
 I/O. Standard input and output. ``lab.process`` is the other side.
 """
@@ -8,32 +8,15 @@ from __future__ import annotations
 import json
 import select
 import sys
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
+Settings = Mapping[str, Any]
 
-@dataclass(frozen=True, slots=True)
-class EndSettings:
-    """Settings of an endpoint, the same for every baseline.
 
-    ``role``: ``ping`` (A) or ``pong`` (B). ``size``, ``count``: of the measured messages. ``pids``: processes whose CPU
-    counts, by machine; A adds itself. ``own``: further settings of this baseline's endpoint.
-    """
-
-    role: str
-    size: int
-    count: int
-    pids: dict[str, list[int]]
-    own: dict[str, str]
-
-    def to_argument(self) -> str:
-        """Return the argument that ``from_argument`` reads."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_argument(cls) -> EndSettings:
-        """Read the only argument of this process."""
-        return cls(**json.loads(sys.argv[1]))
+def run_role(roles: Mapping[str, Callable[[Settings], object]]) -> None:
+    """Run the role of the first argument with the settings of the second, a JSON object."""
+    roles[sys.argv[1]](json.loads(sys.argv[2]))
 
 
 def say(**values: object) -> None:

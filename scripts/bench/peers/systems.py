@@ -10,9 +10,11 @@ settings are the defaults, including its packet sizes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from typing import Any, Final, Literal, Protocol
+from functools import partial
+from typing import Any, Final, Literal
 
 from gdp.trust.right import Right
 from lab.machines import BenchNodes
@@ -21,7 +23,6 @@ from lab.topology import LEFT, MIDDLE, RIGHT
 from peers.certificates import make_certificates
 from peers.chain import NODES, Chain, address
 from peers.gdp_endpoint import PING, PONG
-from peers.jsonl import EndSettings
 
 _GDP: Final = "peers.gdp_endpoint"
 _ZENOH: Final = "peers.zenoh_endpoint"
@@ -32,77 +33,47 @@ _MEASURED_S: Final = 180.0
 
 Measured = Mapping[str, Any]  # what ``exchange`` returns
 Pids = Mapping[str, Sequence[int]]
+Settings = Mapping[str, object]
+Baseline = Callable[..., Measured]
+"""Starts the processes of a way to carry messages on a chain, and measures ``count`` of ``size`` bytes.
+
+Raises ``FailedError``: it is not installed, or did not come up, or lost a message.
+"""
 
 
-class Baseline(Protocol):
-    """A way to carry messages."""
-
-    @property
-    def name(self) -> str:
-        """Return the name of its row."""
-
-    def measure(self, chain: Chain, size: int, count: int) -> Measured:
-        """Start its processes, and measure messages of one size.
-
-        Raises ``FailedError``: it is not installed, or did not come up, or lost a message.
-        """
-
-
-class GdpNet:
-    """Switches with the data plane ``kernel``. ``sign``: what authenticates messages."""
-
-    def __init__(self, sign: Literal["always", "session"]) -> None:
-        self.name = "gdp-kernel" if sign == "always" else "gdp-kernel-session"
-        self._sign = sign
-
-    def measure(self, chain: Chain, size: int, count: int) -> Measured:
-        """Start switches, RIB, B, A; as ``Baseline.measure``."""
-        with ExitStack() as stack:
-            nodes = stack.enter_context(BenchNodes(chain, MIDDLE, plane="kernel", label=self.name))
-            own = [{"sign": self._sign, "config": str(self._admit(nodes, node))} for node in (LEFT, RIGHT)]
-            between = [each.pid for (role, _), each in nodes.running.items() if role == "switch"]
-            return _measured(stack, chain, _GDP, own, {"between": between}, (size, count))
-
-    def _admit(self, nodes: BenchNodes, node: str) -> object:
-        if self._sign == "session":
-            return nodes.admit_member(node, {Right.CALL if node == LEFT else Right.SERVE: [PING]})
-        written, read = (PING, PONG) if node == LEFT else (PONG, PING)
-        return nodes.admit_member(node, {Right.PUBLISH: [written], Right.READ: [read]})
+def measure_gdp(chain: Chain, *, sign: Literal["always", "session"], **load: int) -> Measured:
+    """Start switches with the data plane ``kernel``, RIB, B, A. ``sign``: what authenticates messages."""
+    rights: dict[str, dict[Right, list[str]]] = {
+        LEFT: {Right.PUBLISH: [PING], Right.READ: [PONG]},
+        RIGHT: {Right.PUBLISH: [PONG], Right.READ: [PING]},
+    }
+    if sign == "session":
+        rights = {LEFT: {Right.CALL: [PING]}, RIGHT: {Right.SERVE: [PING]}}
+    with ExitStack() as stack:
+        nodes = stack.enter_context(BenchNodes(chain, MIDDLE, plane="kernel", label=f"gdp-{sign}"))
+        ends = [{"sign": sign, "config": str(nodes.admit_member(*each))} for each in rights.items()]
+        between = [each.pid for (role, _), each in nodes.running.items() if role == "switch"]
+        return _measured(stack, chain, _GDP, ends, {"between": between}, **load)
 
 
-class ZenohNet:
-    """Zenoh with mutual TLS."""
+def measure_zenoh(chain: Chain, **load: int) -> Measured:
+    """Start Zenoh with mutual TLS: routers from the left, then B, then A."""
+    directory = chain.directory / "tls"
+    hosts = {host: [address(host, each) for each in chain.topology.neighbours(host)] for host in NODES}
+    make_certificates(directory, hosts)
 
-    name = "zenoh-mtls"
+    def own(node: str, router: str | None) -> Settings:
+        connect = [f"tls/{address(router, node)}:{_ZENOH_PORT}"] if router else []
+        return {"connect": connect, "certificate": str(directory / node)}
 
-    def measure(self, chain: Chain, size: int, count: int) -> Measured:
-        """Start routers from the left, then B, then A; as ``Baseline.measure``."""
-        with ExitStack() as stack:
-            routers = []
-            for before, node in zip(NODES, MIDDLE, strict=False):
-                own = {"listen": f"tls/0.0.0.0:{_ZENOH_PORT}", **self._identity(chain, node)}
-                if before in MIDDLE:
-                    own["connect"] = self._at(before, node)
-                settings = EndSettings("router", 0, 0, {}, own)
-                started = chain.start(node, "zenoh_router", ["-m", _ZENOH, settings.to_argument()])
-                routers.append(stack.enter_context(started))
-                routers[-1].read(_READY_S)
-            ends = [
-                {"connect": self._at(router, node), **self._identity(chain, node)}
-                for node, router in ((LEFT, MIDDLE[0]), (RIGHT, MIDDLE[-1]))
-            ]
-            return _measured(stack, chain, _ZENOH, ends, {"between": [each.pid for each in routers]}, (size, count))
-
-    def _at(self, router: str, towards: str) -> str:
-        return f"tls/{address(router, towards)}:{_ZENOH_PORT}"
-
-    def _identity(self, chain: Chain, node: str) -> dict[str, str]:
-        """Return the path of a machine's certificate; the first call makes all of them."""
-        directory = chain.directory / "tls"
-        if not directory.exists():
-            hosts = {host: [address(host, each) for each in chain.topology.neighbours(host)] for host in NODES}
-            make_certificates(directory, hosts)
-        return {"certificate": str(directory / node)}
+    with ExitStack() as stack:
+        routers = []
+        for before, node in zip(NODES, MIDDLE, strict=False):
+            listening = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], **own(node, before if before in MIDDLE else None)}
+            routers.append(stack.enter_context(_start(chain, node, _ZENOH, "router", {"own": listening})))
+            routers[-1].read(_READY_S)
+        ends = [{"own": own(node, router)} for node, router in ((LEFT, MIDDLE[0]), (RIGHT, MIDDLE[-1]))]
+        return _measured(stack, chain, _ZENOH, ends, {"between": [each.pid for each in routers]}, **load)
 
 
 def cyclone_xml(own: str, other: str) -> str:
@@ -115,34 +86,31 @@ def cyclone_xml(own: str, other: str) -> str:
     )
 
 
-class CycloneNet:
-    """Cyclone DDS, reliable."""
-
-    name = "cyclone"
-
-    def measure(self, chain: Chain, size: int, count: int) -> Measured:
-        """Start B, then A; as ``Baseline.measure``."""
-        left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
-        own = [{"xml": cyclone_xml(*each)} for each in ((left, right), (right, left))]
-        with ExitStack() as stack:
-            return _measured(stack, chain, _CYCLONE, own, {}, (size, count))
+def measure_cyclone(chain: Chain, **load: int) -> Measured:
+    """Start B and A of Cyclone DDS, reliable."""
+    left, right = address(LEFT, NODES[1]), address(RIGHT, NODES[-2])
+    ends = [{"xml": cyclone_xml(*each)} for each in ((left, right), (right, left))]
+    with ExitStack() as stack:
+        return _measured(stack, chain, _CYCLONE, ends, {}, **load)
 
 
 BASELINES: Final[Mapping[str, Baseline]] = {
-    each.name: each for each in (GdpNet("always"), GdpNet("session"), ZenohNet(), CycloneNet())
+    "gdp-kernel": partial(measure_gdp, sign="always"),
+    "gdp-kernel-session": partial(measure_gdp, sign="session"),
+    "zenoh-mtls": measure_zenoh,
+    "cyclone": measure_cyclone,
 }
 
 
 def _measured(
-    stack: ExitStack, chain: Chain, module: str, own: Sequence[dict[str, str]], pids: Pids, load: tuple[int, int]
+    stack: ExitStack, chain: Chain, module: str, ends: Sequence[Settings], pids: Pids, **load: int
 ) -> Measured:
-    """Start the endpoints at B and A, whose settings ``own`` has in the other order; return the figures of A."""
-
-    def start(role: str, node: str, settings: dict[str, str], counted: Pids) -> LabProcess:
-        every = EndSettings(role, *load, {place: list(each) for place, each in counted.items()}, settings)
-        argv = ["-m", module, every.to_argument()]
-        return stack.enter_context(chain.start(node, module.rpartition(".")[2], argv))
-
-    pong = start("pong", RIGHT, own[1], {})
+    """Start the endpoints at B and A with their settings, which ``ends`` has of A and of B; return the figures of A."""
+    pong = stack.enter_context(_start(chain, RIGHT, module, "pong", ends[1]))
     pong.read(_READY_S)
-    return start("ping", LEFT, own[0], {"receiver": [pong.pid], **pids}).read(_MEASURED_S)
+    settings = {**ends[0], **load, "pids": {"receiver": [pong.pid], **pids}}
+    return stack.enter_context(_start(chain, LEFT, module, "ping", settings)).read(_MEASURED_S)
+
+
+def _start(chain: Chain, node: str, module: str, role: str, settings: Settings) -> LabProcess:
+    return chain.start(node, f"{module.rpartition('.')[2]}-{role}", ["-m", module, role, json.dumps(settings)])

@@ -6,7 +6,6 @@ Process of its own, started by ``systems.py``. Shared memory is off: it would cr
 from __future__ import annotations
 
 import json
-import os
 import signal
 import threading
 import time
@@ -16,8 +15,8 @@ from typing import Final
 
 import zenoh
 
-from peers.exchange import answer_to, exchange
-from peers.jsonl import EndSettings, say
+from peers.exchange import answer_to, ping
+from peers.jsonl import Settings, run_role, say
 
 
 def zenoh_config(
@@ -80,23 +79,21 @@ class ZenohWay:
         self._arrived.set()
 
 
-def main() -> None:
-    """Run ``ping``, ``pong`` or ``router``."""
-    settings = EndSettings.from_argument()
-    own, mode = settings.own, "router" if settings.role == "router" else "client"
-    listen, connect = ([own[key]] if key in own else [] for key in ("listen", "connect"))
-    config = zenoh_config(mode, listen=listen, connect=connect, certificate=own.get("certificate"))
-    with zenoh.open(config) as session:
-        if settings.role == "ping":
-            pids = {"sender": [os.getpid()], **settings.pids}
-            say(**exchange(ZenohWay(session), settings.size, settings.count, pids))
-            return
-        if settings.role == "pong":
-            back = _publisher(session, _PONG)
-            with session.declare_subscriber(_PING, lambda sample: back.put(answer_to(sample.payload.to_bytes()))):
-                _serve()
-        else:
+def _ping(settings: Settings) -> None:
+    with zenoh.open(zenoh_config("client", **settings["own"])) as session:
+        ping(ZenohWay(session), settings)
+
+
+def _pong(settings: Settings) -> None:
+    with zenoh.open(zenoh_config("client", **settings["own"])) as session:
+        back = _publisher(session, _PONG)
+        with session.declare_subscriber(_PING, lambda sample: back.put(answer_to(sample.payload.to_bytes()))):
             _serve()
+
+
+def _route(settings: Settings) -> None:
+    with zenoh.open(zenoh_config("router", **settings["own"])):
+        _serve()
 
 
 def _serve() -> None:
@@ -111,4 +108,4 @@ def _publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
 
 if __name__ == "__main__":
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGINT})  # for sigwait; threads inherit it
-    main()
+    run_role({"ping": _ping, "pong": _pong, "router": _route})

@@ -139,14 +139,15 @@ class Loss:
 
 
 @dataclass(slots=True)
-class Counters:
-    """Frames and bytes of a channel so far.
+class Flow:
+    """Frames and bytes of one direction of a link over a span.
 
     Attributes:
         offered, queue_drops: frames that arrived, and of those, that found the queue full.
         losses, delivered: frames that have left the queue, by their fate.
         delivered_bytes, marked_bytes: of the delivered frames, and of those that the caller marks.
         depth_bytes: highest queue of each tenth of a second in which a frame arrived, in order.
+        capacity_bytes: what the link could carry.
     """
 
     offered: int = 0
@@ -156,6 +157,17 @@ class Counters:
     delivered_bytes: int = 0
     marked_bytes: int = 0
     depth_bytes: list[int] = field(default_factory=list)
+    capacity_bytes: float = 0.0
+
+    @property
+    def share(self) -> float:
+        """Return the bytes that were delivered, of those that the link could carry."""
+        return self.delivered_bytes / max(self.capacity_bytes, 1.0)
+
+    @property
+    def marked_share(self) -> float:
+        """Return the same of the marked frames."""
+        return self.marked_bytes / max(self.capacity_bytes, 1.0)
 
 
 class Channel:
@@ -166,13 +178,14 @@ class Channel:
 
     def __init__(self, rate: Rate, *, delay_ns: int, fifo_bytes: int, loss: Loss) -> None:
         self.rate = rate
-        self.counters = Counters()
+        self.counters = Flow()
         self._delay_ns = delay_ns
         self._fifo_bytes = fifo_bytes
         self._loss = loss
         self._waiting = deque[tuple[int, int, bool, bool]]()  # departure, bytes, lost, marked
         self._backlog = 0
         self._slot = -1
+        self._taken_ns = 0
 
     def offer(self, now_ns: int, size: int, *, is_marked: bool = False) -> int | None:
         """Return when a frame that arrived now is due at the far end; None where it is dropped or lost."""
@@ -208,11 +221,13 @@ class Channel:
         self.rate.rewind(now_ns)
         self._loss.rewind()
 
-    def take_depths(self) -> list[int]:
-        """Return the depths since the last call."""
-        depths, self.counters.depth_bytes = self.counters.depth_bytes, []
-        self._slot = -1
-        return depths
+    def take_flow(self, now_ns: int) -> Flow:
+        """Return the flow since the last call, and begin new counters."""
+        self.backlog_bytes(now_ns)
+        taken, self.counters, self._slot = self.counters, Flow(), -1
+        taken.capacity_bytes = self.rate.capacity_bytes(self._taken_ns, now_ns)
+        self._taken_ns = now_ns
+        return taken
 
     def _note_depth(self, now_ns: int) -> None:
         depths, slot = self.counters.depth_bytes, now_ns // _SLOT_NS

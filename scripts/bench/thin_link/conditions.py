@@ -26,7 +26,7 @@ _LEAST_FRAMES: Final = 2  # one that leaves and one that waits; less cannot be f
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """One direction of a link; ``opportunities_ms`` replaces ``bits_s`` where it is not empty."""
+    """One direction of a link; ``bits_s`` is the mean rate of ``opportunities_ms`` where these are not empty."""
 
     bits_s: float
     delay_ms: float
@@ -34,11 +34,6 @@ class Direction:
     loss: float
     burst: float
     opportunities_ms: Sequence[int] = ()
-
-    @property
-    def mean_bits_s(self) -> float:
-        """Return the mean rate."""
-        return mean_bits_s(self.opportunities_ms) if self.opportunities_ms else self.bits_s
 
     def channel(self, seed: int) -> Channel:
         """Return the channel of this direction."""
@@ -66,15 +61,13 @@ class Conditions:
             fifo: a member of ``FIFOS``.
 
         Raises:
-            LocalError: an unknown word, or a recording that is not there.
+            LocalError: a rate that is none, or a recording that is not there.
         """
-        if loss not in LOSSES or fifo not in FIFOS:
-            raise LocalError(f"loss is one of {', '.join(LOSSES)} and fifo of {', '.join(FIFOS)}")
         share, burst = LOSSES[loss]
         moments = [_moments(rate, side, traces) for side in ("up", "down")]
         made = []
         for each in moments:
-            bits_s = mean_bits_s(each) if each else float(rate) * 1e6
+            bits_s = len(each) * OPPORTUNITY_BYTES * 8e3 / each[-1] if each else float(rate) * 1e6
             made.append(Direction(bits_s, rtt_ms / 2, fifo_bytes(bits_s, rtt_ms, fifo), share, burst, each))
         queue = "FIFO of a BDP" if fifo == "bdp" else "FIFO of a second"
         losing = "2 % loss in bursts" if loss == "burst" else f"{loss} % loss"
@@ -86,11 +79,6 @@ def fifo_bytes(bits_s: float, rtt_ms: float, fifo: str) -> int:
     """Return the depth of a FIFO of one bandwidth-delay product, or of one second; two frames at least."""
     seconds = rtt_ms / 1e3 if fifo == "bdp" else 1.0
     return max(round(bits_s * seconds / 8), _LEAST_FRAMES * FRAME_BYTES)
-
-
-def mean_bits_s(opportunities_ms: Sequence[int]) -> float:
-    """Return the mean rate of a recording."""
-    return len(opportunities_ms) * OPPORTUNITY_BYTES * 8e3 / opportunities_ms[-1]
 
 
 def load_trace(path: Path) -> tuple[int, ...]:

@@ -53,14 +53,14 @@ class Tally:
     Attributes:
         due: messages of the window that were due.
         sent: of those, messages that the system took in time; a publisher that waits misses the others.
-        ages_s: of the whole messages that arrived, by number.
+        ages_s: of the whole messages that were due in the window and arrived.
         whole: whole messages that arrived in the window, whenever they were due.
         broken, doubled: messages that were not whole, or arrived again.
     """
 
     due: int = 0
     sent: int = 0
-    ages_s: dict[int, float] = field(default_factory=dict)
+    ages_s: list[float] = field(default_factory=list)
     whole: int = 0
     broken: int = 0
     doubled: int = 0
@@ -74,9 +74,8 @@ class Exchange:
         self._direction = direction
         self._window: Window | None = None
         self.tallies = {each.name: Tally() for each in self._mix}
-        self._answers: dict[str, tuple[Stream, queue.Queue[tuple[int, int]]]] = {
-            each.answers: (each, queue.Queue(_QUEUE)) for each in self._mix if each.answers
-        }
+        self._arrived = set[tuple[str, int]]()  # stream, number
+        self._requests = {each.answers: queue.Queue[tuple[int, int]](_QUEUE) for each in self._mix if each.answers}
         self.refusals: list[str] = []
         self._senders: dict[str, Callable[[bytes], None]] = {}
 
@@ -109,13 +108,14 @@ class Exchange:
         number, due_ns = opened
         tally.whole += window.has(now_ns)
         if window.has(due_ns):
-            if number in tally.ages_s:
+            if (stream.name, number) in self._arrived:
                 tally.doubled += 1
             else:
-                tally.ages_s[number] = (now_ns - due_ns) / 1e9
-        if stream.name in self._answers:
+                self._arrived.add((stream.name, number))
+                tally.ages_s.append((now_ns - due_ns) / 1e9)
+        if stream.name in self._requests:
             try:
-                self._answers[stream.name][1].put_nowait(opened)
+                self._requests[stream.name].put_nowait(opened)
             except queue.Full:
                 self.refusals.append(f"{stream.name}: too many requests wait")
 
@@ -134,7 +134,7 @@ class Exchange:
 
     def _answer(self, stream: Stream, send: Callable[[bytes], None], window: Window) -> None:
         """Answer each request; the age of an answer counts from when its request was due."""
-        body, waiting, tally = os.urandom(stream.size), self._answers[stream.answers][1], self.tallies[stream.name]
+        body, waiting, tally = os.urandom(stream.size), self._requests[stream.answers], self.tallies[stream.name]
         while True:
             number, due_ns = waiting.get()
             self._send(stream, send, make_message(number, due_ns, body))

@@ -6,7 +6,7 @@ I/O. Starts a process in the namespace between robot and cloud.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -17,6 +17,7 @@ from lab.machines import Lab
 from lab.namespaces import clear_offloads, mac_addresses
 from lab.process import FailedError, LabProcess
 from lab.topology import flat_topology
+from thin_link.channel import Flow
 from thin_link.conditions import FRAME_BYTES, Conditions
 
 ROBOT: Final = "s1"
@@ -25,25 +26,6 @@ LINE: Final = "line"
 ADDRESSES: Final = {ROBOT: "10.99.0.1", CLOUD: "10.99.0.2"}
 _INSIDE: Final = (("a", ROBOT), (ROBOT, LINE), (LINE, CLOUD), (CLOUD, "b"))
 _READY_S: Final = 10.0
-
-
-@dataclass(frozen=True, slots=True)
-class Flow:
-    """One direction of a link over a span.
-
-    Attributes:
-        share: bytes that were delivered, of those that the link could carry.
-        marked_share: the same, of the TCP flow alone.
-        queue_drop_share, loss_share: of the frames offered to the link.
-        depths_bytes: highest queue in each tenth of a second.
-    """
-
-    share: float
-    marked_share: float
-    queue_drop_share: float
-    loss_share: float
-    capacity_bytes: float
-    depths_bytes: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +42,6 @@ class Line:
 
     def __init__(self, process: LabProcess) -> None:
         self._process = process
-        self._before: Mapping[str, Any] = self._ask()
 
     def rewind(self) -> None:
         """Begin recording and losses again: every system meets the same link from here on."""
@@ -68,38 +49,21 @@ class Line:
 
     def begin(self) -> None:
         """Begin a span."""
-        self._before = self._ask()
+        self._ask()
 
     def end(self) -> Used:
         """Return the use of the link since ``begin``.
 
         Raises ``FailedError``: the relay lost a frame itself, so that the figures would mean nothing.
         """
-        before, after = self._before, self._ask()
+        said = self._ask()
         for what in ("oversized", "refused", "kernel_drops"):
-            if count := after[what] - (0 if what == "kernel_drops" else before[what]):
-                raise FailedError(f"the relay of the link had {count} frames {what}")
-        up, down = (_flow(before[side], after[side]) for side in ("up", "down"))
-        return Used(up, down, after["late_us"] / 1e3)
+            if said[what]:
+                raise FailedError(f"the relay of the link had {said[what]} frames {what}")
+        return Used(Flow(**said["up"]), Flow(**said["down"]), said["late_us"] / 1e3)
 
     def _ask(self, **order: bool) -> dict[str, Any]:
         return self._process.ask(report=True, **order)
-
-
-def _flow(before: Mapping[str, Any], after: Mapping[str, Any]) -> Flow:
-    def grown(key: str) -> float:
-        """Return by how much a counter has grown."""
-        return float(after[key] - before[key])
-
-    offered, capacity = max(grown("offered"), 1.0), max(grown("capacity_bytes"), 1.0)
-    return Flow(
-        share=grown("delivered_bytes") / capacity,
-        marked_share=grown("marked_bytes") / capacity,
-        queue_drop_share=grown("queue_drops") / offered,
-        loss_share=grown("losses") / offered,
-        capacity_bytes=capacity,
-        depths_bytes=tuple(after["depth_bytes"]),
-    )
 
 
 def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:

@@ -2,8 +2,8 @@
 
 I/O; two AF_PACKET sockets, whole batches a system call. Run as ``python -m thin_link.relay FILE``; the file holds JSON
 with ``devices`` (from the robot, to the cloud), ``up`` and ``down`` (``Direction``) and ``seed``.
-Each line on its standard input is answered by one line of JSON with all counters; one with the word ``rewind`` begins
-recordings and losses again. It ends with its input.
+Each line on its standard input is answered by one line of JSON with all counters since the last one; one with the word
+``rewind`` begins recordings and losses again. It ends with its input.
 
 It runs under SCHED_FIFO where that is allowed, so the processes that it connects do not delay it. Its devices must have
 no offloads: a channel counts frames, not segments of TCP.
@@ -144,20 +144,17 @@ class _Relay:
 
     def _report(self) -> None:
         now_ns = time.monotonic_ns() - self._start_ns
-        sides = {}
-        for side, way in zip(("up", "down"), self._ways, strict=True):
-            way.channel.backlog_bytes(now_ns)
-            depths = {"depth_bytes": way.channel.take_depths()}
-            capacity = {"capacity_bytes": way.channel.rate.capacity_bytes(0, now_ns)}
-            sides[side] = asdict(way.channel.counters) | capacity | depths
+        up, down = (asdict(way.channel.take_flow(now_ns)) for way in self._ways)
         say(
             oversized=self._oversized,
             refused=sum(self._drops),
             kernel_drops=sum(kernel_drops(way.source) for way in self._ways),
             late_us=percentile(self._late_ns, 0.99) / 1e3 if self._late_ns else 0.0,
-            **sides,
+            up=up,
+            down=down,
         )
         self._late_ns = array("q")
+        self._drops, self._oversized = [0] * len(self._drops), 0
 
 
 def _open(device: str) -> socket.socket:

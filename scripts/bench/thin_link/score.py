@@ -7,12 +7,12 @@ were due; ``fraction`` says how many of all that were due those are.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 from report import percentile
 
 from thin_link.conditions import Conditions
+from thin_link.exchange import Tally
 from thin_link.line import Used
 from thin_link.traffic import Stream, wire_bytes
 
@@ -36,30 +36,22 @@ RELAY_LATE: Final = "relay late p99, ms"
 LINK_COLUMNS: Final = (SHARE, WHOLE, QUEUE_P50, DROPS, SHARE_BOTH, TCP_BOTH, RELAY_LATE)
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
-    """One stream in one window: what was due and sent at one end, and the ages of what arrived at the other."""
+def merged(mix: Sequence[Stream], robot: Mapping[str, Any], cloud: Mapping[str, Any]) -> dict[str, Tally]:
+    """Return all streams of a window, as they left one end and arrived at the other.
 
-    due: int
-    sent: int
-    ages_s: Sequence[float]
-    whole: int = 0  # that arrived in the window, whenever they were due
-
-
-def merged(mix: Sequence[Stream], robot: Mapping[str, Any], cloud: Mapping[str, Any]) -> dict[str, Report]:
-    """Return the reports of all streams; an answer is due for each request that was."""
-    found: dict[str, Report] = {}
+    An answer is due for each request that was.
+    """
+    found: dict[str, Tally] = {}
     for each in mix:
         source, sink = (robot, cloud) if each.direction == "up" else (cloud, robot)
-        sent, arrived = source[each.name], sink[each.name]
-        due = robot[each.answers]["due"] if each.answers else sent["due"]
-        found[each.name] = Report(due, sent["sent"], arrived["ages_s"], arrived["whole"])
+        due = robot[each.answers]["due"] if each.answers else source[each.name]["due"]
+        found[each.name] = Tally(**{**sink[each.name], "due": due, "sent": source[each.name]["sent"]})
     return found
 
 
 def stream_figures(
     stream: Stream,
-    report: Report,
+    report: Tally,
     conditions: Conditions,
     mix: Sequence[Stream],
     could_s: Mapping[str, float],
@@ -87,13 +79,13 @@ def stream_figures(
 def idle_ms(stream: Stream, conditions: Conditions, mix: Sequence[Stream]) -> float:
     """Return the age of a message on the idle link: one way, or for an answer both, and its time on the wire."""
     way = conditions.up if stream.direction == "up" else conditions.down
-    found = way.delay_ms + wire_bytes(stream.size) * 8e3 / way.mean_bits_s
+    found = way.delay_ms + wire_bytes(stream.size) * 8e3 / way.bits_s
     asked = next((each for each in mix if each.name == stream.answers), None)
     return found + (idle_ms(asked, conditions, mix) if asked else 0.0)
 
 
 def whole_share(
-    mix: Sequence[Stream], reports: Mapping[str, Report], could_s: Mapping[str, float], span_s: float
+    mix: Sequence[Stream], reports: Mapping[str, Tally], could_s: Mapping[str, float], span_s: float
 ) -> float:
     """Return the bytes of whole bulk messages, of those that the link could carry in a window."""
     bulk = [each for each in mix if each.bulk]
@@ -103,14 +95,14 @@ def whole_share(
 
 def link_figures(conditions: Conditions, alone: Used, both: Used | None) -> dict[str, float]:
     """Return the figures of the uplink, alone and with a TCP flow."""
-    byte_ms = 8e3 / conditions.up.mean_bits_s
+    byte_ms = 8e3 / conditions.up.bits_s
     found = {
         SHARE: alone.up.share,
-        DROPS: 100 * alone.up.queue_drop_share,
+        DROPS: 100 * alone.up.queue_drops / max(alone.up.offered, 1),
         RELAY_LATE: max(alone.late_ms, both.late_ms if both else 0.0),
     }
-    if alone.up.depths_bytes:
-        found[QUEUE_P50] = byte_ms * percentile(alone.up.depths_bytes, 0.5)
+    if alone.up.depth_bytes:
+        found[QUEUE_P50] = byte_ms * percentile(alone.up.depth_bytes, 0.5)
     if both:
         found[SHARE_BOTH] = both.up.share - both.up.marked_share
         found[TCP_BOTH] = both.up.marked_share
