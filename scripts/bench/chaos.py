@@ -235,7 +235,7 @@ def _explain(seed: int, faults: list[Fault], broke: list[str], overlay: Overlay)
     print("its faults:", *(f"  {each}" for each in faults), sep="\n")
     touched = {target for fault in faults for target in fault.targets}
     for who in sorted(touched & overlay.lives.keys()):
-        print(f"{who}:", *(f"    {line}" for line in overlay.lives[who][-1].last_lines(LOG_LINES)), sep="\n")
+        print(overlay.lives[who][-1].failed("logged at the end", LOG_LINES))
 
 
 def main() -> None:
