@@ -64,6 +64,8 @@ class CapsuleReader:
         if self._offset not in (None, answer.offset) and self._rest:
             self._rest = b""  # a record without its end, before a gap
             self.audit.skip()
+        if answer.described:
+            self._open(answer.described)
         self._offset = answer.offset + len(answer.data)
         data, at = self._rest + answer.data, 0
         while at + RECORD_MIN_BYTES <= len(data):
@@ -93,15 +95,17 @@ class CapsuleReader:
         self.audit.handle_record(wire)
         if self.audit.records == before:
             return  # a second one of this number, or late
-        try:
-            kept = self.opener.open(record)
-        except RemoteError:
-            self.audit.skip()
-            return
-        for each in kept:
+        for each in self._open(wire):
             self._count(each)
             if record.time_ns >= self._from_ns:
                 yield each
+
+    def _open(self, wire: bytes) -> list[Kept]:
+        try:
+            return self.opener.open(Record.from_wire(wire))
+        except RemoteError:
+            self.audit.skip()
+            return []
 
     def _count(self, kept: Kept) -> None:
         if self._next is not None and self._next[0] == kept.incarnation and self._next[1] < kept.sequence:

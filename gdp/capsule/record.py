@@ -119,6 +119,11 @@ def size_of(data: bytes, at: int) -> int:
     return _LENGTH.size + int(_LENGTH.unpack_from(data, at)[0])
 
 
+def number_of(data: bytes) -> int:
+    """Return the number of the record that begins ``data``."""
+    return int(_HEAD.unpack_from(data)[2])
+
+
 def find(data: bytes, at: int) -> int | None:
     """Return where the next undamaged record begins, at ``at`` or later; None: there is none."""
     while at + RECORD_MIN_BYTES <= len(data):

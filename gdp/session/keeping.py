@@ -64,6 +64,7 @@ class KeptTopic:
         self.uploader = Uploader(self.name, ring.descriptor)
         self._waiting = deque[_Waiting]()
         self._waiting_bytes = 0
+        self._described: list[bytes] = []  # frames of the latest description in the ring
         self.lost = self._reported = 0
         self._reading: Future[tuple[int, bytes]] | None = None
         self._call: Call | None = None
@@ -72,7 +73,7 @@ class KeptTopic:
     @property
     def is_busy(self) -> bool:
         """Return whether something waits for the disk or the holder."""
-        return bool(self._waiting or self._reading or self._call)
+        return bool(self._waiting or self._reading or self._call or not self.ring.is_written)
 
     def flush(self, time_ns: int) -> None:
         """Append what was sealed to the ring, with checkpoints where they are due."""
@@ -81,12 +82,17 @@ class KeptTopic:
         while self.ring.is_ready and (self._waiting or self._writer.is_due(time_ns)):
             if not self._writer.is_due(time_ns):
                 each = self._waiting.popleft()
+                frames = each.frames[:]
                 self._waiting_bytes -= each.frames.size_bytes
-                pieces.append(self._writer.append(each.type, time_ns, each.frames[:], each.sequence, each.messages))
+                pieces.append(self._writer.append(each.type, time_ns, frames, each.sequence, each.messages))
+                if each.type is RecordType.DESCRIPTION:
+                    self._described = frames
             elif self.ring.wants_file:
                 self._append(pieces)
                 pieces = []
                 self.ring.append(self._writer.checkpoint(time_ns), begins_file=True)
+                if self._described:  # the file before may be dropped, and its description with it
+                    pieces.append(self._writer.append(RecordType.DESCRIPTION, time_ns, self._described))
             else:
                 pieces.append(self._writer.checkpoint(time_ns))
         self._append(pieces)
@@ -225,8 +231,7 @@ class CapsuleKeeper:
     def handle(self, now: Timestamps) -> None:
         """Write and upload what is there, and handle the timers that are due."""
         if now.mono_s >= self._due_s:
-            for kept in self.topics.values():
-                kept.flush(int(now.unix_s * 1e9))
+            self.flush(now.unix_s)
             is_busy = bool(self.ended) or any(each.is_busy for each in self.topics.values())
             self._due_s = now.mono_s + (PACE_S if is_busy else TICK_S)
         for client in self._clients.values():
@@ -240,9 +245,14 @@ class CapsuleKeeper:
         for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
             self.ended.pop(name).ring.close()
 
+    def flush(self, unix_s: float) -> None:
+        """Append what was published so far, for ``is_uploaded``."""
+        for kept in self.topics.values():
+            kept.flush(int(unix_s * 1e9))
+
     @property
     def is_uploaded(self) -> bool:
-        """Return whether the holders have confirmed all that was published."""
+        """Return whether the holders have confirmed all that was flushed."""
         return all(each.is_uploaded for each in (*self.topics.values(), *self.ended.values()))
 
     @property

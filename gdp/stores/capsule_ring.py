@@ -53,13 +53,18 @@ class CapsuleRing:
         self.begin, self.end = self._segments.begin, self._segments.end
         self._file_bytes = self.end - self._segments.last  # of the last file, what is under way included
         self._next = self.end
-        self._waiting_bytes = 0
+        self._given_bytes = self._done_bytes = 0  # to the thread, and by it
         self.failure = ""
 
     @property
     def is_ready(self) -> bool:
         """Return whether the disk keeps up."""
-        return self._waiting_bytes < _WAITING_MAX_BYTES and not self.failure
+        return self._given_bytes - self._done_bytes < _WAITING_MAX_BYTES and not self.failure
+
+    @property
+    def is_written(self) -> bool:
+        """Return whether all that was appended is on the disk, or has failed."""
+        return self._given_bytes == self._done_bytes
 
     @property
     def wants_file(self) -> bool:
@@ -71,7 +76,7 @@ class CapsuleRing:
         at = self._next if begins_file else None
         self._file_bytes = len(data) if begins_file else self._file_bytes + len(data)
         self._next += len(data)
-        self._waiting_bytes += len(data)
+        self._given_bytes += len(data)
         self._pool.submit(self._append, data, at)
 
     def read(self, offset: int, most: int) -> Future[tuple[int, bytes]]:
@@ -96,7 +101,7 @@ class CapsuleRing:
             self.failure = str(error)
             log.error("capsule not written reason=%s; what follows is lost until this node starts again", error)
         finally:
-            self._waiting_bytes -= len(data)
+            self._done_bytes += len(data)
 
 
 def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain, Segments]:

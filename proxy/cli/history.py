@@ -21,9 +21,12 @@ from gdp.client.participant import Topic
 from gdp.errors import LocalError
 from gdp.session.session import Session, open_session
 from gdp.trust.right import Right
+from proxy.cli.replay import SkipEmpty, WaitReaders
+from proxy.cli.replay import replay as replay_recording
 from proxy.cli.tool_options import Node, print_json, print_text
 from proxy.endpoints.core.endpoint import Origin
 from proxy.node.history import PastMessage, TopicHistory, merged
+from proxy.recordings.folder_writer import open_folder
 from proxy.recordings.writer import BagWriter
 
 _END_NS = (1 << 63) - 1
@@ -33,7 +36,9 @@ Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Topics, as 
 Store = Annotated[str, typer.Option("--holder", metavar="SERVICE", help="The holder's service.")]
 From = Annotated[str | None, typer.Option("--from", metavar="TIME", help="RFC 3339, or Unix seconds.")]
 To = Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same.")]
-Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="An .mcap file; .bag for ROS 1.")]
+Output = Annotated[
+    Path, typer.Option("--output", "-o", metavar="FILE", help="An .mcap file, .bag for ROS 1, else a folder (rosbag2).")
+]
 
 
 def export(
@@ -50,7 +55,11 @@ def export(
     Exit 1: something is damaged, missing, or closed without a grant of its epoch; it is named.
     """
     with failing_clearly():
-        is_whole = _export(names, node, holder, output, (_ns(from_, 0), _ns(to, _END_NS)), json=json)
+        is_whole, count = _export(names, node, holder, output, (_ns(from_, 0), _ns(to, _END_NS)), json=json)
+        if json:
+            print_json({"event": "done", "file": str(output), "messages": count})
+        else:
+            print_text(f"{count} messages are in {output}")
     raise typer.Exit(0 if is_whole else 1)
 
 
@@ -62,25 +71,33 @@ def replay(
     from_: From = None,
     to: To = None,
     rate: Annotated[float, typer.Option(min=0.0, help="1: as it was; 0: as fast as readers confirm.")] = 1.0,
+    skip_empty: SkipEmpty = None,
+    wait_readers: WaitReaders = 15.0,
     data_plane: MemberPlane = None,
     json: Json = False,
     *,
     logs: Logs,
 ) -> None:
-    """Replay what a holder has of topics onto the overlay, as ``gdp-replay`` does with a recording."""
-    from proxy.cli.replay import replay as replay_recording
+    """Replay what a holder has of topics onto the overlay, as ``gdp-replay`` does with a recording.
 
+    Exit 1: as of ``export`` and of ``gdp-replay``.
+    """
     with tempfile.TemporaryDirectory(prefix="gdp-history-") as folder:
         with failing_clearly():
             output = Path(folder) / "history.mcap"
-            _export(names, node, holder, output, (_ns(from_, 0), _ns(to, _END_NS)), json=json)
-        replay_recording(output, config, rate=rate, data_plane=data_plane, json=json, logs=logs)
+            is_whole, _ = _export(names, node, holder, output, (_ns(from_, 0), _ns(to, _END_NS)), json=json)
+        try:
+            replay_recording(
+                output, config, rate, skip_empty, wait_readers, data_plane=data_plane, json=json, logs=logs
+            )
+        except typer.Exit as ended:
+            raise typer.Exit(ended.exit_code or (0 if is_whole else 1)) from ended
 
 
 def _export(
     names: Sequence[str], node: Path, holder: str, output: Path, span_ns: tuple[int, int], *, json: bool
-) -> bool:
-    """Write the recording, and report; return whether it has all."""
+) -> tuple[bool, int]:
+    """Write the recording, and report; return whether it has all, and how many messages it has."""
     with open_session(node) as session:
         histories = [
             TopicHistory(lambda request: _ask(session, holder, request), topic, _name_of(topic, name), *span_ns)
@@ -107,15 +124,16 @@ def _export(
                 print_text(f"{history.name}: {reader.audit.records} records, signed by {about['signer']}")
                 for problem in problems:
                     print_text(f"  {problem}")
-    if json:
-        print_json({"event": "done", "file": str(output), "messages": count})
-    else:
-        print_text(f"{count} messages are in {output}")
-    return is_whole
+    return is_whole, count
 
 
 def _write(output: Path, messages: Iterator[PastMessage]) -> int:
     """Write messages into a new recording; return how many."""
+    if not output.suffix:
+        with open_folder(output) as folder:
+            for message in messages:
+                folder.write(message.channel, message.stamp_ns, message.raw)
+        return folder.written
     first = next(messages, None)
     with BagWriter(output, 2 if first is None else first.channel.ros) as writer:
         for message in chain(() if first is None else (first,), messages):
