@@ -25,6 +25,7 @@ class Ask(str, Enum):
     APPEND = "append"  # records at an offset; a repetition changes nothing
     READ = "read"
     LIST = "list"
+    MARKS = "marks"  # the latest ones, as records
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

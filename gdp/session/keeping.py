@@ -12,18 +12,19 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from gdp.capsule.chain import ChainWriter
+from gdp.capsule.chain import CHECKPOINT_NS, ChainWriter
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import HolderRequest
 from gdp.capsule.record import RecordType
 from gdp.capsule.upload import Uploader
+from gdp.capsule.windows import Mark, Place
 from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import SendOptions
 from gdp.crypto.envelope import Sealed
 from gdp.crypto.identity import Identity
 from gdp.due_queue import earliest
-from gdp.errors import GdpError
+from gdp.errors import GdpError, StoreError
 from gdp.intervals import PACE_S, SCHEDULED_S, TICK_S
 from gdp.limits import WINDOW_BYTES
 from gdp.names import Name
@@ -44,10 +45,14 @@ class _Waiting(NamedTuple):
     frames: Sealed
     sequence: int
     messages: int
+    mark: Mark | None = None
 
 
 class KeptTopic:
     """One topic that is kept.
+
+    Args:
+        around_ns: what is kept before and after each mark; None: everything is.
 
     Attributes:
         ring: on the disk here.
@@ -55,16 +60,27 @@ class KeptTopic:
         lost: messages that the disk here did not take in time.
     """
 
-    def __init__(self, publisher: Publisher, ring: CapsuleRing, key: Identity, holder: Name) -> None:
+    def __init__(
+        self,
+        publisher: Publisher,
+        ring: CapsuleRing,
+        key: Identity,
+        holder: Name,
+        around_ns: tuple[int, int] | None = None,
+    ) -> None:
         self._publisher = publisher
         self.ring = ring
         self.holder = holder
         self.name = ring.descriptor.name
         self._writer = ChainWriter(ring.chain, key.key)
         self.uploader = Uploader(self.name, ring.descriptor)
+        self._windows = None if around_ns is None else ring.windows(*around_ns)
+        self._mark = ring.mark  # number of the record of the last one
+        self._marked: dict[str, int] = {}  # when each name was marked last
         self._waiting = deque[_Waiting]()
         self._waiting_bytes = 0
         self._described: list[bytes] = []  # frames of the latest description in the ring
+        self._describes = False  # it is repeated before the next message
         self.lost = self._reported = 0
         self._reading: Future[tuple[int, bytes]] | None = None
         self._call: Call | None = None
@@ -78,24 +94,55 @@ class KeptTopic:
     def flush(self, time_ns: int) -> None:
         """Append what was sealed to the ring, with checkpoints where they are due."""
         self._publisher.seal_recorded()
-        pieces = list[bytes]()
-        while self.ring.is_ready and (self._waiting or self._writer.is_due(time_ns)):
-            if not self._writer.is_due(time_ns):
+        pieces, windows = list[bytes](), self._windows
+        while self.ring.is_ready and (self._waiting or self._is_due(time_ns)):
+            if self._waiting and not self._writer.is_due(time_ns):
                 each = self._waiting.popleft()
                 frames = each.frames[:]
                 self._waiting_bytes -= each.frames.size_bytes
-                pieces.append(self._writer.append(each.type, time_ns, frames, each.sequence, each.messages))
                 if each.type is RecordType.DESCRIPTION:
-                    self._described = frames
-            elif self.ring.wants_file:
-                self._append(pieces)
-                pieces = []
-                self.ring.append(self._writer.checkpoint(time_ns), begins_file=True)
-                if self._described:  # the file before may be dropped, and its description with it
+                    self._described, self._describes = frames, False
+                elif self._describes and each.mark is None:
                     pieces.append(self._writer.append(RecordType.DESCRIPTION, time_ns, self._described))
-            else:
-                pieces.append(self._writer.checkpoint(time_ns))
+                    self._describes = False
+                elif each.mark is not None:
+                    frames = [each.mark._replace(previous=self._mark).to_bytes(), *frames]
+                    self._mark = self._writer.chain.number
+                pieces.append(self._writer.append(each.type, time_ns, frames, each.sequence, each.messages))
+                continue
+            begins_file = self.ring.wants_file
+            self._append(pieces)
+            at, pieces = Place(self.ring.next, self._writer.chain.number, time_ns), []
+            self.ring.append(self._writer.checkpoint(time_ns), begins_file=begins_file)
+            if windows is not None:
+                if windows.is_due(time_ns) and not self._waiting:
+                    windows.close(self.ring.next)
+                windows.add_checkpoint(at)
+                self.ring.trim(windows.drop(self.uploader.confirmed))
+            # what is before may be left out or dropped, and its description with it
+            self._describes = begins_file or windows is not None
         self._append(pieces)
+
+    def _is_due(self, time_ns: int) -> bool:
+        return self._writer.is_due(time_ns) or (self._windows is not None and self._windows.is_due(time_ns))
+
+    def mark(self, name: str, time_ns: int) -> None:
+        """Mark an event, and open a window around it; one that repeats within a second extends its window alone.
+
+        Raises:
+            StoreError: the disk takes no records now.
+        """
+        self.flush(time_ns)
+        if not self.ring.is_ready:
+            raise StoreError(f"{name} is not marked: {self.ring.failure or 'the disk is too slow'}")
+        mark = Mark(0, time_ns, time_ns, 0) if self._windows is None else self._windows.mark(time_ns)
+        recorder, last_ns = self._publisher.queue.recorder, self._marked.get(name)
+        if recorder is None or (last_ns is not None and time_ns - last_ns < CHECKPOINT_NS):
+            return
+        self._marked[name] = time_ns
+        self._waiting.append(_Waiting(RecordType.MARK, recorder.seal_mark(name, time_ns), 0, 0, mark))
+        self._waiting_bytes += self._waiting[-1].frames.size_bytes
+        self.flush(time_ns)
 
     def _append(self, pieces: list[bytes]) -> None:
         if pieces:
@@ -118,7 +165,7 @@ class KeptTopic:
                 uploader.handle_failure(str(error), now_s)
             else:
                 self._ask(uploader.append(offset, data), client, now_s)
-        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s)
+        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s, self._windows)
         if isinstance(wanted, HolderRequest):
             self._ask(wanted, client, now_s)
         elif wanted is not None:
@@ -134,7 +181,10 @@ class KeptTopic:
     @property
     def is_uploaded(self) -> bool:
         """Return whether the holder has confirmed all that is here."""
-        return not self.is_busy and self.uploader.confirmed == self.ring.end
+        confirmed, begin, end = self.uploader.confirmed, self.ring.begin, self.ring.end
+        windows = self._windows
+        is_whole = confirmed == end if windows is None else windows.next(max(confirmed, begin), end) is None
+        return is_whole and not self.is_busy
 
     def poll_faults(self) -> list[str]:
         """Return, once, what went wrong: what the holder refused or never had, and messages that are not kept."""
@@ -191,12 +241,21 @@ class CapsuleKeeper:
         self.ended: dict[Name, KeptTopic] = {}
         self._due_s = 0.0
 
-    def keep(self, topic: Topic, publisher: Publisher, holder: Topic, most_bytes: int, unix_s: float) -> KeptTopic:
+    def keep(
+        self,
+        topic: Topic,
+        publisher: Publisher,
+        holder: Topic,
+        most_bytes: int,
+        unix_s: float,
+        around_ns: tuple[int, int] | None = None,
+    ) -> KeptTopic:
         """Keep what a publisher publishes from now on.
 
         Args:
             holder: the delegation to call the holder's service.
             most_bytes: of the ring.
+            around_ns: as of ``KeptTopic``.
 
         Raises:
             GdpError: no delegation, or the folder cannot be read or written.
@@ -209,7 +268,7 @@ class CapsuleKeeper:
         if holder.name not in self._clients:
             label = f"holder {holder.name.short}"
             self._clients[holder.name] = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
-        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, holder.name)
+        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, holder.name, around_ns)
         log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
         return kept
 

@@ -7,13 +7,15 @@ record. What was confirmed to no holder may be lost with the disk; then another 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Final
 
 from gdp.capsule.chain import Chain
 from gdp.capsule.descriptor import Descriptor
-from gdp.capsule.record import find, split
+from gdp.capsule.record import Record, RecordType, find, size_of, split
+from gdp.capsule.windows import Mark, Place, Windows
 from gdp.errors import GdpError, RemoteError, StoreError
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.segments import SEGMENT_BYTES, Segments
@@ -39,6 +41,7 @@ class CapsuleRing:
         descriptor: of the capsule.
         end: behind the last byte that is on the disk.
         begin: of the first byte here.
+        mark: number of the last mark that ``windows`` found; 0: there is none.
         failure: why the disk does not take records; empty while it does.
 
     Raises:
@@ -54,6 +57,7 @@ class CapsuleRing:
         self._file_bytes = self.end - self._segments.last  # of the last file, what is under way included
         self._next = self.end
         self._given_bytes = self._done_bytes = 0  # to the thread, and by it
+        self.mark = 0
         self.failure = ""
 
     @property
@@ -83,6 +87,34 @@ class CapsuleRing:
         """Return what will be the bytes at an offset."""
         return self._pool.submit(self._segments.read, offset, most)
 
+    @property
+    def next(self) -> int:
+        """Return the offset of what is appended next."""
+        return self._next
+
+    def trim(self, needed: int) -> None:
+        """Drop the files whose records all stand below an offset."""
+        self._pool.submit(self._trim, needed)
+
+    def windows(self, before_ns: int, after_ns: int) -> Windows:
+        """Return the windows that the records here open."""
+        windows, places, segments = Windows(before_ns, after_ns), dict[int, int](), self._segments
+        for offset in segments.offsets:
+            at, data = offset, segments.read(offset, segments.size_of(offset))[1]
+            for wire in _whole(data):
+                record = Record.from_wire(wire)
+                if record.type is RecordType.CHECKPOINT:
+                    places[record.number] = at
+                    windows.add_checkpoint(Place(at, record.number, record.time_ns))
+                    if windows.is_due(record.time_ns):
+                        windows.close(at + len(wire))
+                elif record.type is RecordType.MARK:
+                    mark = Mark.from_record(record)
+                    windows.restore(mark, places.get(mark.first, segments.begin))
+                    self.mark = record.number
+                at += len(wire)
+        return windows
+
     def close(self) -> None:
         """Put everything on the disk; returns when that is done."""
         self._pool.submit(self._segments.close).result()
@@ -93,15 +125,29 @@ class CapsuleRing:
         try:
             if not self.failure:
                 segments.append(data, at=at)
-                while segments.held_bytes > self._most_bytes and len(segments.offsets) > 1:
-                    segments.drop(segments.begin)
-                self.begin, self.end = segments.begin, segments.end
+                self._trim(0)
+                self.end = segments.end
         except (StoreError, OSError) as error:
             # a record is missing from now on, so nothing may follow it: a new run continues behind the last one
             self.failure = str(error)
             log.error("capsule not written reason=%s; what follows is lost until this node starts again", error)
         finally:
             self._done_bytes += len(data)
+
+    def _trim(self, needed: int) -> None:
+        segments = self._segments
+        while len(segments.offsets) > 1 and (segments.held_bytes > self._most_bytes or segments.offsets[1] <= needed):
+            segments.drop(segments.begin)
+        self.begin = segments.begin
+
+
+def _whole(data: bytes) -> Iterator[bytes]:
+    """Yield the records of a file up to the first damage, which its holder names."""
+    at = 0
+    while find(data, at) == at:
+        size = size_of(data, at)
+        yield data[at : at + size]
+        at += size
 
 
 def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain, Segments]:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Final
 
@@ -35,6 +35,7 @@ from gdp.stores.transactions import TransactionFile
 log = logging.getLogger(__name__)
 
 _RESTS_MAX_BYTES: Final = 4 * RECORD_MAX_BYTES
+_MARKS_MAX: Final = 1_024  # in one answer
 SPARE_BYTES: Final = 256 << 20  # of the disk, for what others write
 _TABLE: Final = """
 CREATE TABLE IF NOT EXISTS checkpoints (
@@ -44,6 +45,7 @@ CREATE INDEX IF NOT EXISTS times ON checkpoints (capsule, time_ns);
 CREATE TABLE IF NOT EXISTS descriptions (
     capsule BLOB, number INTEGER, wire BLOB, PRIMARY KEY (capsule, number)
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS marks (capsule BLOB, number INTEGER, wire BLOB, PRIMARY KEY (capsule, number)) WITHOUT ROWID;
 """
 
 
@@ -154,6 +156,8 @@ class CapsuleStore(ClosedOnExit):
             capsule = self._capsules.get(request.capsule)
             if capsule is None:
                 return HolderAnswer().to_cbor()
+            if request.ask is Ask.MARKS:
+                return HolderAnswer(data=b"".join(_marks(self._index, capsule.name))).to_cbor()
             if request.ask is Ask.HEAD:
                 return HolderAnswer(head=capsule.segments.end, offset=capsule.segments.end).to_cbor()
             return self._read(capsule, request).to_cbor()
@@ -300,14 +304,31 @@ class CapsuleStore(ClosedOnExit):
             self._put(capsule.name, found)
 
     def _put(self, capsule: Name, found: list[tuple[int, Record, bytes]]) -> None:
-        """Index checkpoints, by their offsets, and descriptions, which outlive their segment."""
+        """Index checkpoints, by their offsets, and descriptions and marks, which outlive their segment."""
         if not found:
             return
         places = [(capsule, at, of.number, of.time_ns) for at, of, _ in found if of.type is RecordType.CHECKPOINT]
         described = [(capsule, of.number, wire) for _, of, wire in found if of.type is RecordType.DESCRIPTION]
+        marks = [(capsule, of.number, wire) for _, of, wire in found if of.type is RecordType.MARK]
         with self._index.writing() as index:
             index.executemany("INSERT OR REPLACE INTO checkpoints VALUES (?, ?, ?, ?)", places)
             index.executemany("INSERT OR REPLACE INTO descriptions VALUES (?, ?, ?)", described)
+            index.executemany("INSERT OR REPLACE INTO marks VALUES (?, ?, ?)", marks)
+
+
+def _marks(index: TransactionFile, name: Name) -> list[bytes]:
+    """Return the records of the latest marks of a capsule, as many as an answer may have, in order."""
+    query = "SELECT wire FROM marks WHERE capsule = ? ORDER BY number DESC LIMIT ?"
+    with index.reading() as open_index:
+        found = [row[0] for row in open_index.execute(query, (name, _MARKS_MAX))]
+    sizes = accumulate(map(len, found))
+    return [wire for wire, size in zip(found, sizes, strict=True) if size <= BATCH_BYTES][::-1]
+
+
+def marks_of(folder: Path, name: Name) -> list[Record]:
+    """Return the latest marks of a capsule in a store. Raises ``StoreError``: the index cannot be read."""
+    with TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL") as index:
+        return [Record.from_wire(wire) for wire in _marks(index, name)]
 
 
 def _refuse_others(descriptor: Descriptor, client: Name) -> None:

@@ -102,6 +102,7 @@ class Keeping:
     flow: Flow
     folder: Path
     most_bytes: int = 1 << 24
+    around_ns: tuple[int, int] | None = None
     keeper: CapsuleKeeper = field(init=False)
     kept: KeptTopic = field(init=False)
     worked_s: float = 0.0
@@ -112,7 +113,9 @@ class Keeping:
         self.keeper = CapsuleKeeper(member, identity, self.folder, start=7, pool=Inline())
         service = world.topic(STORE, member, [Right.CALL], kind="service")
         unix_s = world.network.now.unix_s
-        self.kept = self.keeper.keep(self.flow.topic, self.flow.publisher, service, self.most_bytes, unix_s)
+        self.kept = self.keeper.keep(
+            self.flow.topic, self.flow.publisher, service, self.most_bytes, unix_s, self.around_ns
+        )
 
     def work(self) -> None:
         """Write and upload."""
