@@ -55,6 +55,7 @@ class Site(NamedTuple):
     lab: SessionLab
     drive: list[Message]
     store: Path
+    holder: LabProcess
 
     @property
     def all(self) -> dict[str, list[int]]:
@@ -117,7 +118,7 @@ def history_site(seconds: float) -> Iterator[Site]:
         holder = lab.launch(["gdp", "store", "serve", "holder", "--store", str(store), "--json"])
         assert '"ready"' in lines_of(holder, 1)[0]
         (lab.folder / "state").mkdir()
-        yield Site(lab, messages(drive), store)
+        yield Site(lab, messages(drive), store, holder)
 
 
 def ended(process: LabProcess) -> tuple[int | None, list[dict[str, Any]]]:

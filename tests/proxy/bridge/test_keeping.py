@@ -6,6 +6,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
+import pytest
+
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.sansio import Timestamps
@@ -97,3 +99,23 @@ def test_a_message_a_lost_uplink_and_a_fault_mark_the_topics_whose_rules_state_t
     assert news() == []
     assert keeper.mark("bumped", 2.0) == 2
     assert news() == [("/scan", "bumped"), ("/image", "bumped")]
+
+
+@pytest.mark.parametrize(
+    ("keys", "around_ns", "when"),
+    [
+        ({}, None, ()),
+        ({"before": "60s", "after": 1}, (60_000_000_000, 1_000_000_000), ()),
+        ({"when": "/estop"}, (60_000_000_000, 30_000_000_000), ("/estop",)),
+        (
+            {"before": "1.5s", "when": ["/estop", "uplink-lost"]},
+            (1_500_000_000, 30_000_000_000),
+            ("/estop", "uplink-lost"),
+        ),
+    ],
+)
+def test_windows_are_stated_by_seconds_and_events(
+    keys: dict[str, object], around_ns: tuple[int, int] | None, when: tuple[str, ...]
+) -> None:
+    keep = Keep.model_validate({"to": "store", **keys})
+    assert (keep.around_ns, keep.when) == (around_ns, when)
