@@ -85,14 +85,11 @@ class Windows:
         for each in self._places:
             if each.time_ns <= from_ns:
                 place = each
-        self._open(place.offset, to_ns)
+        self.open(place.offset, to_ns)
         return Mark(place.number, from_ns, to_ns, 0)
 
-    def restore(self, mark: Mark, begin: int) -> None:
-        """Open the window of a mark that an earlier run has made; ``begin``: offset of its first record."""
-        self._open(begin, mark.to_ns)
-
-    def _open(self, begin: int, to_ns: int) -> None:
+    def open(self, begin: int, to_ns: int) -> None:
+        """Open a window from an offset until a time, or extend the one that touches it."""
         last = self._windows[-1] if self._windows else None
         if last is not None and (last.end is None or begin <= last.end):
             last.end, last.to_ns = None, max(last.to_ns, to_ns)

@@ -7,7 +7,6 @@ record. What was confirmed to no holder may be lost with the disk; then another 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Final
@@ -100,19 +99,20 @@ class CapsuleRing:
         """Return the windows that the records here open."""
         windows, places, segments = Windows(before_ns, after_ns), dict[int, int](), self._segments
         for offset in segments.offsets:
-            at, data = offset, segments.read(offset, segments.size_of(offset))[1]
-            for wire in _whole(data):
-                record = Record.from_wire(wire)
+            at, data = 0, segments.read(offset, segments.size_of(offset))[1]
+            while find(data, at) == at:  # behind a damage nothing is marked; the audit names it
+                end = at + size_of(data, at)
+                record = Record.from_wire(data[at:end])
                 if record.type is RecordType.CHECKPOINT:
-                    places[record.number] = at
-                    windows.add_checkpoint(Place(at, record.number, record.time_ns))
+                    places[record.number] = offset + at
+                    windows.add_checkpoint(Place(offset + at, record.number, record.time_ns))
                     if windows.is_due(record.time_ns):
-                        windows.close(at + len(wire))
+                        windows.close(offset + end)
                 elif record.type is RecordType.MARK:
                     mark = Mark.from_record(record)
-                    windows.restore(mark, places.get(mark.first, segments.begin))
+                    windows.open(places.get(mark.first, segments.begin), mark.to_ns)
                     self.mark = record.number
-                at += len(wire)
+                at = end
         return windows
 
     def close(self) -> None:
@@ -139,15 +139,6 @@ class CapsuleRing:
         while len(segments.offsets) > 1 and (segments.held_bytes > self._most_bytes or segments.offsets[1] <= needed):
             segments.drop(segments.begin)
         self.begin = segments.begin
-
-
-def _whole(data: bytes) -> Iterator[bytes]:
-    """Yield the records of a file up to the first damage, which its holder names."""
-    at = 0
-    while find(data, at) == at:
-        size = size_of(data, at)
-        yield data[at : at + size]
-        at += size
 
 
 def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain, Segments]:

@@ -27,7 +27,7 @@ from proxy.cli.replay import replay as replay_recording
 from proxy.cli.tool_options import Node, print_json, print_text
 from proxy.endpoints.core.endpoint import Origin
 from proxy.node.history import PastMessage, TopicHistory, marks_of, merged
-from proxy.recordings.folder_writer import open_folder
+from proxy.recordings.folder_writer import write_folder
 from proxy.recordings.writer import BagWriter
 
 _MARK = "mark:"
@@ -144,10 +144,7 @@ def _export(
 def _write(output: Path, messages: Iterator[PastMessage]) -> int:
     """Write messages into a new recording; return how many."""
     if not output.suffix:
-        with open_folder(output) as folder:
-            for message in messages:
-                folder.write(message.channel, message.stamp_ns, message.raw)
-        return folder.written
+        return write_folder(output, ((each.stamp_ns, each.channel, each.raw) for each in messages))
     first = next(messages, None)
     with BagWriter(output, 2 if first is None else first.channel.ros) as writer:
         for message in chain(() if first is None else (first,), messages):
