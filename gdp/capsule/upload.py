@@ -46,7 +46,7 @@ class Uploader:
         self._faults: list[str] = []
 
     def next_step(
-        self, begin: int, end: int, now_s: float, windows: Windows | None = None
+        self, begin: int, end: int, now_s: float, windows: Windows | None = None, most_bytes: int = BATCH_BYTES
     ) -> HolderRequest | Span | None:
         """Return a request to send, or what to read for the next one, or None.
 
@@ -54,6 +54,7 @@ class Uploader:
             begin: offset of the first byte here.
             end: behind the last byte on the disk here.
             windows: what stands in none of them is left out; None: everything is uploaded.
+            most_bytes: of one request.
         """
         if self._is_under_way or now_s < self._retry_s:
             return None
@@ -71,7 +72,7 @@ class Uploader:
         if self._head >= end:
             return None
         self._is_under_way = True
-        return Span(self._head, min(end - self._head, BATCH_BYTES))
+        return Span(self._head, min(end - self._head, most_bytes))
 
     def append(self, offset: int, data: bytes) -> HolderRequest:
         """Return the request with records that were read."""

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from gdp.capsule.chain import CHECKPOINT_NS, ChainWriter
 from gdp.capsule.descriptor import Descriptor
-from gdp.capsule.holder import HolderRequest
+from gdp.capsule.holder import BATCH_BYTES, YIELDING_BYTES, HolderRequest
 from gdp.capsule.record import RecordType
 from gdp.capsule.upload import Uploader
 from gdp.capsule.windows import Mark, Place
@@ -148,8 +148,8 @@ class KeptTopic:
         if pieces:
             self.ring.append(b"".join(pieces), begins_file=False)
 
-    def upload(self, client: ClientCore, now_s: float) -> None:
-        """Send the next request if none is under way."""
+    def upload(self, client: ClientCore, now_s: float, most_bytes: int) -> None:
+        """Send the next request, with records of this size at most, if none is under way; 0: begin none."""
         call, reading, uploader = self._call, self._reading, self.uploader
         if call is not None and call.is_done:
             self._call = None
@@ -165,13 +165,15 @@ class KeptTopic:
                 uploader.handle_failure(str(error), now_s)
             else:
                 self._ask(uploader.append(offset, data), client, now_s)
-        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s, self._windows)
+        if not most_bytes:
+            return
+        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s, self._windows, most_bytes)
         if isinstance(wanted, HolderRequest):
             self._ask(wanted, client, now_s)
         elif wanted is not None:
             self._reading = self.ring.read(wanted.offset, wanted.size)
             if self._reading.done():
-                self.upload(client, now_s)
+                self.upload(client, now_s, most_bytes)
 
     @property
     def is_reading(self) -> bool:
@@ -239,7 +241,7 @@ class CapsuleKeeper:
         self._clients: dict[Name, ClientCore] = {}
         self.topics: dict[Name, KeptTopic] = {}
         self.ended: dict[Name, KeptTopic] = {}
-        self._due_s = 0.0
+        self._due_s = self._yielding_s = 0.0
 
     def keep(
         self,
@@ -297,8 +299,10 @@ class CapsuleKeeper:
             due_s = client.get_timer()
             if due_s is not None and now.mono_s >= due_s:
                 client.handle_timer(now.mono_s)
+        yielding_bytes = self._yielding_bytes(now.mono_s)
         for kept in (*self.topics.values(), *self.ended.values()):
-            kept.upload(self._clients[kept.holder], now.mono_s)
+            most_bytes = BATCH_BYTES if kept.ring.is_pressed(kept.uploader.confirmed) else yielding_bytes
+            kept.upload(self._clients[kept.holder], now.mono_s, most_bytes)
             if kept.is_reading:
                 self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
         for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
@@ -308,6 +312,20 @@ class CapsuleKeeper:
         """Append what was published so far, for ``is_uploaded``."""
         for kept in self.topics.values():
             kept.flush(int(unix_s * 1e9))
+
+    def _yielding_bytes(self, now_s: float) -> int:
+        """Return how much a request may carry: little if there are live readers, and nothing while they are sent to.
+
+        A stream that never pauses is yielded to for ``PACE_S`` before each request.
+        """
+        live = [each for each in self._member.publications if each.matched.active]
+        is_sending = any(each.sent_frames.is_under_way(name) for each in live for name in each.matched.active)
+        if not is_sending:
+            self._yielding_s = now_s
+        if now_s < self._yielding_s + PACE_S and is_sending:
+            return 0
+        self._yielding_s = now_s
+        return YIELDING_BYTES if live else BATCH_BYTES
 
     @property
     def is_uploaded(self) -> bool:
