@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.journeys.capsules import Holder, Keeping
-from tests.journeys.flows import ROBOT, SERVER, advertise, outlive_together, ring
+from tests.journeys.flows import ROBOT, SERVER, advertise, ring
 
 UPLINK_BYTES_S = 1_250_000
 IMAGE_BYTES = 40_000
@@ -50,5 +50,5 @@ def test_a_live_image_waits_little_for_an_upload(tmp_path: Path, backlog: bool) 
     assert (left > 1_000_000) is backlog
     assert keeping.kept.uploader.confirmed > (500_000 if backlog else 0)
     assert statistics.median(ages_s) < (1.4 if backlog else 1.1) * ALONE_S
+    keeping.run(5, holder)
     assert keeping.run(20, holder, until=keeping.is_uploaded)
-    outlive_together(camera, keeping.flow)
