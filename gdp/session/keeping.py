@@ -318,7 +318,7 @@ class CapsuleKeeper:
 
         A stream that never pauses is yielded to for ``PACE_S`` before each request.
         """
-        live = [each for each in self._member.publications if each.matched.active]
+        live = [each for each in self._member.publications if each.matched.active and each.topic not in self._clients]
         is_sending = any(each.sent_frames.is_under_way(name) for each in live for name in each.matched.active)
         if not is_sending:
             self._yielding_s = now_s
