@@ -21,6 +21,7 @@ MTU_HOLD_S: Final = 10.0  # ... and once more after this time
 
 # Messages
 MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; its fragments must fit into JOIN_SOURCE_BYTES
+MARK_MAX_CHARS: Final = 256  # of the name of an event
 SEQUENCE_BYTES: Final = 8  # before each message, under its seal: its sequence number
 NUMBER_MAX: Final = (1 << 64) - 2  # message numbers have 64 bits, and each must have a successor
 PARTS_MAX: Final = 1 << 17  # 64 MiB over the smallest link

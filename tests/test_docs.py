@@ -24,6 +24,7 @@ from gdp.config.schema import Section
 from gdp.crypto.keys import SigningKey
 from gdp.errors import ConfigError
 from internet_demo import cli as internet_demo
+from memory_demo import cli as memory_demo
 from proxy.cli import delegate, proxy, replay
 from proxy.config.config import ProxyConfig
 from ring import cli as ring
@@ -49,6 +50,7 @@ APPS = {
     "scripts/ring_topology.sh": ring.app,
     "scripts/fog_demo.sh": demo.app,
     "scripts/internet_demo.sh": internet_demo.app,
+    "scripts/memory_demo.sh": memory_demo.app,
 }
 SHELLS = ("bash", "sh")
 MODELS: dict[str, type[Section]] = {

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from gdp.capsule.checkpoint import HINT_BYTES, Checkpoint, root_of
 from gdp.capsule.opening import verify_frames
 from gdp.capsule.record import Record, RecordType, find, leaf_of, size_of
+from gdp.capsule.windows import Mark
 from gdp.crypto.keys import PublicKey
 from gdp.errors import RemoteError
 from gdp.names import Name
@@ -55,6 +56,8 @@ class Audit:
         records: undamaged ones.
         proven: number of the last checkpoint of the writer.
         begin: number of the first record; where it is above 0, the records before it are not here.
+        gaps: records without a cause yet, by the number of the checkpoint behind them.
+        left_out: records between windows, which the writer did not upload, in the same way.
     """
 
     def __init__(self, name: Name, key: PublicKey, *, known: bytes | None = None, is_deep: bool = False) -> None:
@@ -70,6 +73,11 @@ class Audit:
         self._has_begun = False
         self._is_broken = False  # bytes before the next record are no record
         self.begin = self.proven = self.records = 0
+        self.gaps: dict[int, range] = {}
+        self.left_out: dict[int, range] = {}
+        self._late: set[int] = set()  # records of gaps that came later
+        self._time_ns = self._window_ns = 0  # of the last record; end of the windows so far
+        self._mark = 0  # number of the last mark
 
     @property
     def findings(self) -> list[Finding]:
@@ -96,6 +104,8 @@ class Audit:
         """Return all findings, once everything was added."""
         if self._is_broken:
             self._find(Damage.ALTERED, self._next, self._next, "bytes behind the last record")
+        for number in [each for gap in self.gaps.values() for each in gap if each not in self._late]:
+            self._find(Damage.REMOVED, number, number)
         for number, damage in self._missing.items():
             self._find(damage, number, number)
         known = self._known
@@ -115,7 +125,10 @@ class Audit:
         if number < self._next:
             self._handle_late(number, leaf)
             return
-        for each in range(self._next, number):
+        is_gap = self._is_gap(record)
+        if is_gap:
+            self.gaps[number] = range(self._next, number)
+        for each in () if is_gap else range(self._next, number):
             self._missing[each] = Damage.ALTERED if self._is_broken else Damage.REMOVED
         if self._is_broken and number == self._next:
             self._find(Damage.ALTERED, number, number, "bytes before it that are no record")
@@ -125,10 +138,30 @@ class Audit:
         self.records += 1
         if self._known is not None and number == self._known.number and leaf != self._known_leaf:
             self._find(Damage.FORKED, number, number, "the writer signed another checkpoint of this number")
+        self._time_ns = record.time_ns
         if record.type is RecordType.CHECKPOINT:
-            self._judge(record)
+            self._judge(record, is_first=is_gap or number == self.begin)
         elif self._is_deep:
             self._verify(record)
+        if record.type is RecordType.MARK:
+            self._handle_mark(record)
+
+    def _is_gap(self, record: Record) -> bool:
+        """Return whether a window may begin with a record: it is a checkpoint, and one ended the window before."""
+        is_checkpoint = record.type is RecordType.CHECKPOINT and self.proven == self._next - 1
+        return record.number > self._next and is_checkpoint and self._time_ns >= self._window_ns and not self._is_broken
+
+    def _handle_mark(self, record: Record) -> None:
+        try:
+            mark = Mark.from_record(record)
+        except RemoteError as error:
+            self._find(Damage.ALTERED, record.number, record.number, str(error))
+            return
+        if self.begin < mark.previous != self._mark:
+            self._find(Damage.REMOVED, mark.previous, mark.previous, "a mark, with its window")
+        if mark.first in self.gaps:
+            self.left_out[mark.first] = self.gaps.pop(mark.first)
+        self._mark, self._window_ns = record.number, max(self._window_ns, mark.to_ns)
 
     def _handle_late(self, number: int, leaf: bytes) -> None:
         known = self._leaves.get(number)
@@ -138,18 +171,19 @@ class Audit:
             self._find(Damage.FORKED, number, number, "another record has the same number")
         else:
             self._missing.pop(number, None)
+            self._late.add(number)
             self._found.pop((Damage.REMOVED, number), None)
             self._leaves[number] = leaf
             self._find(Damage.REORDERED, number, self._next - 1)
 
     def _verify(self, record: Record) -> None:
         try:
-            verify_frames(record.frames, self._key)
+            verify_frames(record.sealed, self._key)
         except RemoteError as error:
             self._find(Damage.ALTERED, record.number, record.number, str(error))
 
-    def _judge(self, record: Record) -> None:
-        """Compare a checkpoint with the records that it covers."""
+    def _judge(self, record: Record, *, is_first: bool) -> None:
+        """Compare a checkpoint with the records that it covers, unless it is the first here, or behind a gap."""
         number = record.number
         try:
             checkpoint = Checkpoint.from_record(record)
@@ -157,7 +191,8 @@ class Audit:
         except RemoteError as error:
             self._find(Damage.ALTERED, number, number, f"not signed by the writer: {error}")
             return
-        if number == self.begin:
+        if is_first:
+            self.proven, self._leaves = number, {number: self._leaves[number]}
             return
         if checkpoint.first > self.proven:
             self._find_unproven(checkpoint.first)

@@ -15,6 +15,7 @@ from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.names import ZERO, Name
 
 BATCH_BYTES: Final = 512 << 10  # of records in one request or answer
+YIELDING_BYTES: Final = 16 << 10  # ... in one request next to live traffic
 LISTED_MAX: Final = 1_024
 
 
@@ -25,6 +26,7 @@ class Ask(str, Enum):
     APPEND = "append"  # records at an offset; a repetition changes nothing
     READ = "read"
     LIST = "list"
+    MARKS = "marks"  # the latest ones, as records
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +62,7 @@ class HolderAnswer(FieldSet):
         head: behind the last byte that is on its disk.
         offset: what is to be appended next; of records that were read, where they begin: as asked, or behind a gap.
         data: records, or a part of the last one.
+        described: the record with the description that holds where ``data`` begins, if records before it are skipped.
         descriptors: of the listed capsules.
     """
 
@@ -67,6 +70,7 @@ class HolderAnswer(FieldSet):
     head: Annotated[int, Keyed("head", uint(), absent=0, is_omitted=True)] = 0
     offset: Annotated[int, Keyed("offset", uint(), absent=0, is_omitted=True)] = 0
     data: Annotated[bytes, Keyed("data", octets(most=2 * BATCH_BYTES), absent=b"", is_omitted=True)] = b""
+    described: Annotated[bytes, Keyed("described", octets(most=BATCH_BYTES), absent=b"", is_omitted=True)] = b""
     descriptors: Annotated[
         tuple[Descriptor, ...],
         Keyed("descriptors", many(inner(Descriptor), LISTED_MAX), absent=(), is_omitted=True),

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from gdp.burst.cipher import BODY_AT
 from gdp.capsule.record import Record, RecordType
+from gdp.capsule.windows import Mark
 from gdp.client.key_epochs import Openers, Secrets
 from gdp.crypto.envelope import SIGNATURE_BYTES, digest_of
 from gdp.crypto.keys import PublicKey
@@ -59,6 +60,14 @@ def verify_frames(frames: Sequence[bytes], key: PublicKey) -> Header:
     return header
 
 
+class NamedMark(NamedTuple):
+    """A mark, opened: when it was made, what it is called, and its window."""
+
+    time_ns: int
+    name: str
+    window: Mark
+
+
 class CapsuleOpener:
     """Opens the records of one capsule, in order.
 
@@ -69,6 +78,7 @@ class CapsuleOpener:
     Attributes:
         closed: records of epochs without a secret here, by epoch.
         description: the latest.
+        marks: those that were opened.
     """
 
     def __init__(self, topic: Name, writer: Name, secrets: Secrets, key: PublicKey) -> None:
@@ -77,16 +87,17 @@ class CapsuleOpener:
         self._openers: dict[int, Openers] = {}  # by incarnation
         self.closed: dict[int, int] = {}
         self.description = b""
+        self.marks: list[NamedMark] = []
 
     def open(self, record: Record) -> list[Kept]:
-        """Return the messages of a record; none of a description or a checkpoint, or without the epoch's secret.
+        """Return the messages of a record; none of another kind, or without the epoch's secret.
 
         Raises:
             RemoteError: it is not the writer's, of another topic, or altered.
         """
         if record.type is RecordType.CHECKPOINT:
             return []
-        frames = record.frames
+        frames = record.sealed
         header = verify_frames(frames, self._key)
         if header.source != self._writer or header.destination != self._topic:
             raise RemoteError(DropReason.WRONG_NAME, "a message of another topic or writer")
@@ -97,11 +108,15 @@ class CapsuleOpener:
         if openers is None:
             ends = self._writer, header.incarnation, self._topic
             openers = self._openers[header.incarnation] = Openers(self._secrets, *ends, is_signed=True)
-        is_message = record.type is RecordType.MESSAGE
-        opener = openers.opener(Kind.DATA if is_message else Kind.HEARTBEAT, header.epoch)
+        is_description = record.type is RecordType.DESCRIPTION
+        opener = openers.opener(Kind.HEARTBEAT if is_description else Kind.DATA, header.epoch)
         plain = b"".join([opener.open(decode(frame), frame)[0] for frame in frames])
-        if not is_message:
+        if is_description:
             self.description = Heartbeat.from_wire(plain).description
+            return []
+        if record.type is RecordType.MARK:
+            name = plain[SEQUENCE_BYTES:].decode(errors="replace")
+            self.marks.append(NamedMark(int.from_bytes(plain[:SEQUENCE_BYTES], "big"), name, Mark.from_record(record)))
             return []
         sequence, body = int.from_bytes(plain[:SEQUENCE_BYTES], "big"), plain[SEQUENCE_BYTES:]
         messages = unpack(body) if header.flags & Flag.BUNDLE else [body]

@@ -38,7 +38,7 @@ class CapsuleReader:
     Attributes:
         audit: of what was read.
         opener: counts what stays closed.
-        lost: messages that are missing between two others.
+        lost: messages that are missing between two others; ``left_out``: those between windows.
         is_done: nothing is left to be read.
     """
 
@@ -47,11 +47,22 @@ class CapsuleReader:
         self._from_ns, self._to_ns = from_ns, to_ns
         self.audit = Audit(descriptor.name, descriptor.key)
         self.opener = CapsuleOpener(descriptor.topic.name, descriptor.writer.name, secrets, descriptor.key)
-        self.lost: list[Lost] = []
+        self._holes: list[tuple[Lost, int]] = []  # with the number of the checkpoint behind a gap, or 0
         self.is_done = False
         self._offset: int | None = None
         self._rest = b""
         self._next: tuple[int, int] | None = None  # incarnation and sequence number of the next message
+        self._number = 0  # of the last record with a message
+
+    @property
+    def lost(self) -> list[Lost]:
+        """Return what is missing, and should not be."""
+        return [lost for lost, gap in self._holes if gap not in self.audit.left_out]
+
+    @property
+    def left_out(self) -> list[Lost]:
+        """Return what the writer left out, since it stood in no window."""
+        return [lost for lost, gap in self._holes if gap in self.audit.left_out]
 
     def next_request(self) -> HolderRequest:
         """Return the next request."""
@@ -64,6 +75,8 @@ class CapsuleReader:
         if self._offset not in (None, answer.offset) and self._rest:
             self._rest = b""  # a record without its end, before a gap
             self.audit.skip()
+        if answer.described:
+            self._open(answer.described)
         self._offset = answer.offset + len(answer.data)
         data, at = self._rest + answer.data, 0
         while at + RECORD_MIN_BYTES <= len(data):
@@ -86,24 +99,27 @@ class CapsuleReader:
 
     def _messages(self, wire: bytes) -> Iterator[Kept]:
         record = Record.from_wire(wire)
-        if record.time_ns > self._to_ns:
+        if record.time_ns > self._to_ns and not self.audit.gaps:  # a mark names the cause of a gap before it
             self.is_done = True
             return
         before = self.audit.records
         self.audit.handle_record(wire)
         if self.audit.records == before:
             return  # a second one of this number, or late
-        try:
-            kept = self.opener.open(record)
-        except RemoteError:
-            self.audit.skip()
-            return
-        for each in kept:
-            self._count(each)
+        for each in self._open(wire) if record.time_ns <= self._to_ns else ():
+            self._count(each, record.number)
             if record.time_ns >= self._from_ns:
                 yield each
 
-    def _count(self, kept: Kept) -> None:
+    def _open(self, wire: bytes) -> list[Kept]:
+        try:
+            return self.opener.open(Record.from_wire(wire))
+        except RemoteError:
+            self.audit.skip()
+            return []
+
+    def _count(self, kept: Kept, number: int) -> None:
         if self._next is not None and self._next[0] == kept.incarnation and self._next[1] < kept.sequence:
-            self.lost.append(Lost(kept.incarnation, self._next[1], kept.sequence - 1))
-        self._next = kept.incarnation, kept.sequence + 1
+            behind = next((end for end in (*self.audit.gaps, *self.audit.left_out) if self._number < end < number), 0)
+            self._holes.append((Lost(kept.incarnation, self._next[1], kept.sequence - 1), behind))
+        self._next, self._number = (kept.incarnation, kept.sequence + 1), number

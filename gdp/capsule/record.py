@@ -1,10 +1,11 @@
-"""Record of a capsule: one sealed message as it was sent, a sealed description, or a checkpoint.
+"""Record of a capsule: one sealed message as it was sent, a sealed description, a checkpoint, or a mark.
 
 Sans-I/O. Wire form, big-endian::
 
     record  length of what follows (4) | type (1) | number (8) | time in ns since 1970 (8) | sequence number (8)
             | messages (4) | body | CRC-32 of all before (4)
     body    for each frame: length (2) | frame;  or a checkpoint (``checkpoint.py``)
+            of a mark, its statement (``windows.py``) stands before the frames as one more
 
 The numbers of records rise by one. A bundle has the sequence number of its first message. Where nothing was published,
 ``messages`` is 0.
@@ -36,6 +37,7 @@ class RecordType(IntEnum):
     MESSAGE = 1
     DESCRIPTION = 2  # a sealed Heartbeat that brings the publisher's description
     CHECKPOINT = 3
+    MARK = 4  # an event, by its name and time
 
 
 _TYPES: Final = {int(each): each for each in RecordType}
@@ -86,6 +88,11 @@ class Record(NamedTuple):
             frames.append(body[begin:at])
         return frames
 
+    @property
+    def sealed(self) -> list[bytes]:
+        """Return the frames that are sealed. Raises ``RemoteError``: MALFORMED."""
+        return self.frames[1 if self.type is RecordType.MARK else 0 :]
+
 
 def body_of(frames: Sequence[bytes]) -> bytes:
     """Return the body with these frames."""
@@ -117,6 +124,11 @@ def split(data: bytes, at: int = 0) -> Iterator[bytes]:
 def size_of(data: bytes, at: int) -> int:
     """Return the bytes of the record that begins at ``at``."""
     return _LENGTH.size + int(_LENGTH.unpack_from(data, at)[0])
+
+
+def number_of(data: bytes) -> int:
+    """Return the number of the record that begins ``data``."""
+    return int(_HEAD.unpack_from(data)[2])
 
 
 def find(data: bytes, at: int) -> int | None:

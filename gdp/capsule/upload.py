@@ -11,6 +11,7 @@ from typing import Final
 
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import BATCH_BYTES, Ask, HolderAnswer, HolderRequest
+from gdp.capsule.windows import Windows
 from gdp.errors import RemoteError
 from gdp.intervals import NEVER_S, RETRY_S
 from gdp.names import Name
@@ -44,25 +45,34 @@ class Uploader:
         self.is_refused = False
         self._faults: list[str] = []
 
-    def next_step(self, begin: int, end: int, now_s: float) -> HolderRequest | Span | None:
+    def next_step(
+        self, begin: int, end: int, now_s: float, windows: Windows | None = None, most_bytes: int = BATCH_BYTES
+    ) -> HolderRequest | Span | None:
         """Return a request to send, or what to read for the next one, or None.
 
         Args:
             begin: offset of the first byte here.
             end: behind the last byte on the disk here.
+            windows: what stands in none of them is left out; None: everything is uploaded.
+            most_bytes: of one request.
         """
         if self._is_under_way or now_s < self._retry_s:
             return None
         if self._head is None:
             self._is_under_way = True
             return HolderRequest(ask=Ask.HEAD, capsule=self._name)
+        if windows is not None:
+            span = windows.next(self._head, end)
+            if span is None:
+                return None
+            self._head, end = span
         if self._head < begin:
             self._note(f"the holder never had bytes {self._head} to {begin}: the ring here was full")
             self._head = begin
         if self._head >= end:
             return None
         self._is_under_way = True
-        return Span(self._head, min(end - self._head, BATCH_BYTES))
+        return Span(self._head, min(end - self._head, most_bytes))
 
     def append(self, offset: int, data: bytes) -> HolderRequest:
         """Return the request with records that were read."""

@@ -14,15 +14,18 @@ from typing import Annotated, ClassVar
 import typer
 
 from gdp.capsule.record import Record, RecordType, split
+from gdp.capsule.windows import Mark
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
+from gdp.cli.local_nodes import Node as LocalNode
+from gdp.cli.local_nodes import connect
 from gdp.cli.node import Json, Logs, failing_clearly, report, running
 from gdp.cli.program import ungrouped
 from gdp.errors import LocalError
-from gdp.intervals import DAY_S
+from gdp.intervals import ANSWER_S, DAY_S
 from gdp.names import Name
 from gdp.session.protocol.messages import Request
 from gdp.session.session import open_session
-from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, StoreLimits, remove, stored
+from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, StoreLimits, marks_of, remove, stored
 from gdp.terminal import echo
 
 
@@ -35,6 +38,7 @@ app = typer.Typer(cls=_Store, no_args_is_help=True, help="Hold capsules, the his
 Folder = Annotated[Path, typer.Option("--store", metavar="FOLDER", help="Where the holder has its capsules.")]
 Which = Annotated[str, typer.Argument(metavar="NAME", help="The capsule: its first hex digits suffice.")]
 _DAMAGED = 1
+_REPLY_BYTES = 1_024
 
 
 @app.command(epilog="Example: gdp store serve holder --service store --store /var/lib/gdp/capsules --quota 100")
@@ -79,13 +83,39 @@ def list_capsules(store: Folder, json: Json = False) -> None:
 
 @app.command(epilog="Example: gdp store show 75e1 --store /var/lib/gdp/capsules")
 def show(name: Which, store: Folder, json: Json = False) -> None:
-    """Show a capsule: who writes it, since when, and each segment."""
+    """Show a capsule: who writes it, since when, each segment, and its marks, whose names are sealed."""
     with failing_clearly():
         capsule = _find(store, name)
         segments = [
             {"offset": offset, "bytes": capsule.segments.size_of(offset)} for offset in capsule.segments.offsets
         ]
-        _print({**_row(capsule), "metadata": dict(capsule.descriptor.metadata), "segments": segments}, json=json)
+        marks = [
+            {"record": each.number, "at": _time(each.time_ns), "from": _time(mark.from_ns), "to": _time(mark.to_ns)}
+            for each in marks_of(store, capsule.name)
+            for mark in [Mark.from_record(each)]
+        ]
+        metadata = dict(capsule.descriptor.metadata)
+        _print({**_row(capsule), "metadata": metadata, "segments": segments, "marks": marks}, json=json)
+
+
+@app.command(epilog="Example: gdp store mark bumped")
+def mark(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="What the event is called; readers of the topics see it.")
+    ],
+    node: LocalNode = None,
+    json: Json = False,
+) -> None:
+    """Mark an event now, in every topic that a proxy of this machine keeps; windows open around it."""
+    with failing_clearly(), connect(node) as connection:
+        target = str(connection.status().get("name"))
+        common = {"target": target, "timeout_s": ANSWER_S, "reply_bytes": _REPLY_BYTES}
+        reply = connection.ask("mark", **common, body={"mark": name})
+        result = reply.get("result")
+        if not isinstance(result, Mapping) or not result.get("topics"):
+            why = result.get("error") if isinstance(result, Mapping) else None
+            raise LocalError(f"{name} is not marked: {why or 'this node keeps no topic; add keep to a rule'}")
+        report("marked", f"{name} is marked in {result['topics']} topics", json=json, topics=result["topics"])
 
 
 @app.command(epilog="Example: gdp store verify 75e1 --store /var/lib/gdp/capsules --known last.checkpoint")
@@ -141,16 +171,19 @@ def _find(store: Path, digits: str) -> StoredCapsule:
 
 def _row(capsule: StoredCapsule) -> dict[str, object]:
     segments, descriptor = capsule.segments, capsule.descriptor
-    begun = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(descriptor.begun_ms / 1e3))
     return {
         "capsule": capsule.name.to_text(),
         "topic": descriptor.topic.name.to_text(),
         "writer": descriptor.writer.name.to_text(),
-        "begun": begun,
+        "begun": _time(descriptor.begun_ms * 1_000_000),
         "bytes": segments.held_bytes,
         "begin": segments.begin,
         "head": segments.end,
     }
+
+
+def _time(time_ns: int) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(time_ns / 1e9))
 
 
 def _last_checkpoint(capsule: StoredCapsule) -> bytes:

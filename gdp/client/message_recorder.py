@@ -64,10 +64,20 @@ class MessageRecorder:
             sequence, (together, _) = unsent.first, unsent.poll_batch(BUNDLE_BYTES)
             count, prefix = len(together), sequence.to_bytes(SEQUENCE_BYTES, "big")
             body, flags = together[0] if count == 1 else pack(together), queue.flags | _BUNDLE * (count > 1)
-            number = queue.next_number
-            queue.next_number += 1
-            self.on_sealed(self._keys.data.seal(number, flags, body, self._mtu, prefix), sequence, count)
+            self.on_sealed(self._seal(flags, body, prefix), sequence, count)
         queue.set_depth(queue.depth)  # the window learns of the numbers
+
+    def seal_mark(self, name: str, time_ns: int) -> Sealed:
+        """Return the sealed name and time of an event, which no reader gets."""
+        self.seal_unsent()
+        sealed = self._seal(self._queue.flags, name.encode(), time_ns.to_bytes(SEQUENCE_BYTES, "big"))
+        self._queue.set_depth(self._queue.depth)
+        return sealed
+
+    def _seal(self, flags: int, body: bytes, prefix: bytes) -> Sealed:
+        number = self._queue.next_number
+        self._queue.next_number += 1
+        return self._keys.data.seal(number, flags, body, self._mtu, prefix)
 
     def record_description(self, number: int, heartbeat: bytes) -> None:
         """Record a Heartbeat with the description that holds from now on."""

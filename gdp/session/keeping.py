@@ -12,18 +12,19 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from gdp.capsule.chain import ChainWriter
+from gdp.capsule.chain import CHECKPOINT_NS, ChainWriter
 from gdp.capsule.descriptor import Descriptor
-from gdp.capsule.holder import HolderRequest
+from gdp.capsule.holder import BATCH_BYTES, YIELDING_BYTES, HolderRequest
 from gdp.capsule.record import RecordType
 from gdp.capsule.upload import Uploader
+from gdp.capsule.windows import Mark, Place
 from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import SendOptions
 from gdp.crypto.envelope import Sealed
 from gdp.crypto.identity import Identity
 from gdp.due_queue import earliest
-from gdp.errors import GdpError
+from gdp.errors import GdpError, StoreError
 from gdp.intervals import PACE_S, SCHEDULED_S, TICK_S
 from gdp.limits import WINDOW_BYTES
 from gdp.names import Name
@@ -44,10 +45,14 @@ class _Waiting(NamedTuple):
     frames: Sealed
     sequence: int
     messages: int
+    mark: Mark | None = None
 
 
 class KeptTopic:
     """One topic that is kept.
+
+    Args:
+        around_ns: what is kept before and after each mark; None: everything is.
 
     Attributes:
         ring: on the disk here.
@@ -55,15 +60,27 @@ class KeptTopic:
         lost: messages that the disk here did not take in time.
     """
 
-    def __init__(self, publisher: Publisher, ring: CapsuleRing, key: Identity, holder: Name) -> None:
+    def __init__(
+        self,
+        publisher: Publisher,
+        ring: CapsuleRing,
+        key: Identity,
+        holder: Name,
+        around_ns: tuple[int, int] | None = None,
+    ) -> None:
         self._publisher = publisher
         self.ring = ring
         self.holder = holder
         self.name = ring.descriptor.name
         self._writer = ChainWriter(ring.chain, key.key)
         self.uploader = Uploader(self.name, ring.descriptor)
+        self._windows = None if around_ns is None else ring.windows(*around_ns)
+        self._mark = ring.mark  # number of the record of the last one
+        self._marked: dict[str, int] = {}  # when each name was marked last
         self._waiting = deque[_Waiting]()
         self._waiting_bytes = 0
+        self._described: list[bytes] = []  # frames of the latest description in the ring
+        self._describes = False  # it is repeated before the next message
         self.lost = self._reported = 0
         self._reading: Future[tuple[int, bytes]] | None = None
         self._call: Call | None = None
@@ -72,31 +89,67 @@ class KeptTopic:
     @property
     def is_busy(self) -> bool:
         """Return whether something waits for the disk or the holder."""
-        return bool(self._waiting or self._reading or self._call)
+        return bool(self._waiting or self._reading or self._call or not self.ring.is_written)
 
     def flush(self, time_ns: int) -> None:
         """Append what was sealed to the ring, with checkpoints where they are due."""
         self._publisher.seal_recorded()
-        pieces = list[bytes]()
-        while self.ring.is_ready and (self._waiting or self._writer.is_due(time_ns)):
-            if not self._writer.is_due(time_ns):
+        pieces, windows = list[bytes](), self._windows
+        while self.ring.is_ready and (self._waiting or self._is_due(time_ns)):
+            if self._waiting and not self._writer.is_due(time_ns):
                 each = self._waiting.popleft()
+                frames = each.frames[:]
                 self._waiting_bytes -= each.frames.size_bytes
-                pieces.append(self._writer.append(each.type, time_ns, each.frames[:], each.sequence, each.messages))
-            elif self.ring.wants_file:
-                self._append(pieces)
-                pieces = []
-                self.ring.append(self._writer.checkpoint(time_ns), begins_file=True)
-            else:
-                pieces.append(self._writer.checkpoint(time_ns))
+                if each.type is RecordType.DESCRIPTION:
+                    self._described, self._describes = frames, False
+                elif self._describes and each.mark is None:
+                    pieces.append(self._writer.append(RecordType.DESCRIPTION, time_ns, self._described))
+                    self._describes = False
+                elif each.mark is not None:
+                    frames = [each.mark._replace(previous=self._mark).to_bytes(), *frames]
+                    self._mark = self._writer.chain.number
+                pieces.append(self._writer.append(each.type, time_ns, frames, each.sequence, each.messages))
+                continue
+            begins_file = self.ring.wants_file
+            self._append(pieces)
+            at, pieces = Place(self.ring.next, self._writer.chain.number, time_ns), []
+            self.ring.append(self._writer.checkpoint(time_ns), begins_file=begins_file)
+            if windows is not None:
+                if windows.is_due(time_ns) and not self._waiting:
+                    windows.close(self.ring.next)
+                windows.add_checkpoint(at)
+                self.ring.trim(windows.drop(self.uploader.confirmed))
+            # what is before may be left out or dropped, and its description with it
+            self._describes = begins_file or windows is not None
         self._append(pieces)
+
+    def _is_due(self, time_ns: int) -> bool:
+        return self._writer.is_due(time_ns) or (self._windows is not None and self._windows.is_due(time_ns))
+
+    def mark(self, name: str, time_ns: int) -> None:
+        """Mark an event, and open a window around it; one that repeats within a second extends its window alone.
+
+        Raises:
+            StoreError: the disk takes no records now.
+        """
+        self.flush(time_ns)
+        if not self.ring.is_ready:
+            raise StoreError(f"{name} is not marked: {self.ring.failure or 'the disk is too slow'}")
+        mark = Mark(0, time_ns, time_ns, 0) if self._windows is None else self._windows.mark(time_ns)
+        recorder, last_ns = self._publisher.queue.recorder, self._marked.get(name)
+        if recorder is None or (last_ns is not None and time_ns - last_ns < CHECKPOINT_NS):
+            return
+        self._marked[name] = time_ns
+        self._waiting.append(_Waiting(RecordType.MARK, recorder.seal_mark(name, time_ns), 0, 0, mark))
+        self._waiting_bytes += self._waiting[-1].frames.size_bytes
+        self.flush(time_ns)
 
     def _append(self, pieces: list[bytes]) -> None:
         if pieces:
             self.ring.append(b"".join(pieces), begins_file=False)
 
-    def upload(self, client: ClientCore, now_s: float) -> None:
-        """Send the next request if none is under way."""
+    def upload(self, client: ClientCore, now_s: float, most_bytes: int) -> None:
+        """Send the next request, with records of this size at most, if none is under way; 0: begin none."""
         call, reading, uploader = self._call, self._reading, self.uploader
         if call is not None and call.is_done:
             self._call = None
@@ -112,13 +165,15 @@ class KeptTopic:
                 uploader.handle_failure(str(error), now_s)
             else:
                 self._ask(uploader.append(offset, data), client, now_s)
-        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s)
+        if not most_bytes:
+            return
+        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s, self._windows, most_bytes)
         if isinstance(wanted, HolderRequest):
             self._ask(wanted, client, now_s)
         elif wanted is not None:
             self._reading = self.ring.read(wanted.offset, wanted.size)
             if self._reading.done():
-                self.upload(client, now_s)
+                self.upload(client, now_s, most_bytes)
 
     @property
     def is_reading(self) -> bool:
@@ -128,7 +183,10 @@ class KeptTopic:
     @property
     def is_uploaded(self) -> bool:
         """Return whether the holder has confirmed all that is here."""
-        return not self.is_busy and self.uploader.confirmed == self.ring.end
+        confirmed, begin, end = self.uploader.confirmed, self.ring.begin, self.ring.end
+        windows = self._windows
+        is_whole = confirmed == end if windows is None else windows.next(max(confirmed, begin), end) is None
+        return is_whole and not self.is_busy
 
     def poll_faults(self) -> list[str]:
         """Return, once, what went wrong: what the holder refused or never had, and messages that are not kept."""
@@ -183,14 +241,23 @@ class CapsuleKeeper:
         self._clients: dict[Name, ClientCore] = {}
         self.topics: dict[Name, KeptTopic] = {}
         self.ended: dict[Name, KeptTopic] = {}
-        self._due_s = 0.0
+        self._due_s = self._yielding_s = 0.0
 
-    def keep(self, topic: Topic, publisher: Publisher, holder: Topic, most_bytes: int, unix_s: float) -> KeptTopic:
+    def keep(
+        self,
+        topic: Topic,
+        publisher: Publisher,
+        holder: Topic,
+        most_bytes: int,
+        unix_s: float,
+        around_ns: tuple[int, int] | None = None,
+    ) -> KeptTopic:
         """Keep what a publisher publishes from now on.
 
         Args:
             holder: the delegation to call the holder's service.
             most_bytes: of the ring.
+            around_ns: as of ``KeptTopic``.
 
         Raises:
             GdpError: no delegation, or the folder cannot be read or written.
@@ -203,7 +270,7 @@ class CapsuleKeeper:
         if holder.name not in self._clients:
             label = f"holder {holder.name.short}"
             self._clients[holder.name] = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
-        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, holder.name)
+        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, holder.name, around_ns)
         log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
         return kept
 
@@ -225,24 +292,44 @@ class CapsuleKeeper:
     def handle(self, now: Timestamps) -> None:
         """Write and upload what is there, and handle the timers that are due."""
         if now.mono_s >= self._due_s:
-            for kept in self.topics.values():
-                kept.flush(int(now.unix_s * 1e9))
+            self.flush(now.unix_s)
             is_busy = bool(self.ended) or any(each.is_busy for each in self.topics.values())
             self._due_s = now.mono_s + (PACE_S if is_busy else TICK_S)
         for client in self._clients.values():
             due_s = client.get_timer()
             if due_s is not None and now.mono_s >= due_s:
                 client.handle_timer(now.mono_s)
+        yielding_bytes = self._yielding_bytes(now.mono_s)
         for kept in (*self.topics.values(), *self.ended.values()):
-            kept.upload(self._clients[kept.holder], now.mono_s)
+            most_bytes = BATCH_BYTES if kept.ring.is_pressed(kept.uploader.confirmed) else yielding_bytes
+            kept.upload(self._clients[kept.holder], now.mono_s, most_bytes)
             if kept.is_reading:
                 self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
         for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
             self.ended.pop(name).ring.close()
 
+    def flush(self, unix_s: float) -> None:
+        """Append what was published so far, for ``is_uploaded``."""
+        for kept in self.topics.values():
+            kept.flush(int(unix_s * 1e9))
+
+    def _yielding_bytes(self, now_s: float) -> int:
+        """Return how much a request may carry: little if there are live readers, and nothing while they are sent to.
+
+        A stream that never pauses is yielded to for ``PACE_S`` before each request.
+        """
+        live = [each for each in self._member.publications if each.matched.active and each.topic not in self._clients]
+        is_sending = any(each.sent_frames.is_under_way(name) for each in live for name in each.matched.active)
+        if not is_sending:
+            self._yielding_s = now_s
+        if now_s < self._yielding_s + PACE_S and is_sending:
+            return 0
+        self._yielding_s = now_s
+        return YIELDING_BYTES if live else BATCH_BYTES
+
     @property
     def is_uploaded(self) -> bool:
-        """Return whether the holders have confirmed all that was published."""
+        """Return whether the holders have confirmed all that was flushed."""
         return all(each.is_uploaded for each in (*self.topics.values(), *self.ended.values()))
 
     @property

@@ -13,7 +13,8 @@ from typing import Final
 
 from gdp.capsule.chain import Chain
 from gdp.capsule.descriptor import Descriptor
-from gdp.capsule.record import find, split
+from gdp.capsule.record import Record, RecordType, find, size_of, split
+from gdp.capsule.windows import Mark, Place, Windows
 from gdp.errors import GdpError, RemoteError, StoreError
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.segments import SEGMENT_BYTES, Segments
@@ -39,6 +40,7 @@ class CapsuleRing:
         descriptor: of the capsule.
         end: behind the last byte that is on the disk.
         begin: of the first byte here.
+        mark: number of the last mark that ``windows`` found; 0: there is none.
         failure: why the disk does not take records; empty while it does.
 
     Raises:
@@ -53,13 +55,19 @@ class CapsuleRing:
         self.begin, self.end = self._segments.begin, self._segments.end
         self._file_bytes = self.end - self._segments.last  # of the last file, what is under way included
         self._next = self.end
-        self._waiting_bytes = 0
+        self._given_bytes = self._done_bytes = 0  # to the thread, and by it
+        self.mark = 0
         self.failure = ""
 
     @property
     def is_ready(self) -> bool:
         """Return whether the disk keeps up."""
-        return self._waiting_bytes < _WAITING_MAX_BYTES and not self.failure
+        return self._given_bytes - self._done_bytes < _WAITING_MAX_BYTES and not self.failure
+
+    @property
+    def is_written(self) -> bool:
+        """Return whether all that was appended is on the disk, or has failed."""
+        return self._given_bytes == self._done_bytes
 
     @property
     def wants_file(self) -> bool:
@@ -71,12 +79,45 @@ class CapsuleRing:
         at = self._next if begins_file else None
         self._file_bytes = len(data) if begins_file else self._file_bytes + len(data)
         self._next += len(data)
-        self._waiting_bytes += len(data)
+        self._given_bytes += len(data)
         self._pool.submit(self._append, data, at)
 
     def read(self, offset: int, most: int) -> Future[tuple[int, bytes]]:
         """Return what will be the bytes at an offset."""
         return self._pool.submit(self._segments.read, offset, most)
+
+    def is_pressed(self, confirmed: int) -> bool:
+        """Return whether what no holder has confirmed fills more than a part of the ring."""
+        return self.end - max(self.begin, confirmed) > self._most_bytes // _PARTS
+
+    @property
+    def next(self) -> int:
+        """Return the offset of what is appended next."""
+        return self._next
+
+    def trim(self, needed: int) -> None:
+        """Drop the files whose records all stand below an offset."""
+        self._pool.submit(self._trim, needed)
+
+    def windows(self, before_ns: int, after_ns: int) -> Windows:
+        """Return the windows that the records here open."""
+        windows, places, segments = Windows(before_ns, after_ns), dict[int, int](), self._segments
+        for offset in segments.offsets:
+            at, data = 0, segments.read(offset, segments.size_of(offset))[1]
+            while find(data, at) == at:  # behind a damage nothing is marked; the audit names it
+                end = at + size_of(data, at)
+                record = Record.from_wire(data[at:end])
+                if record.type is RecordType.CHECKPOINT:
+                    places[record.number] = offset + at
+                    windows.add_checkpoint(Place(offset + at, record.number, record.time_ns))
+                    if windows.is_due(record.time_ns):
+                        windows.close(offset + end)
+                elif record.type is RecordType.MARK:
+                    mark = Mark.from_record(record)
+                    windows.open(places.get(mark.first, segments.begin), mark.to_ns)
+                    self.mark = record.number
+                at = end
+        return windows
 
     def close(self) -> None:
         """Put everything on the disk; returns when that is done."""
@@ -88,15 +129,20 @@ class CapsuleRing:
         try:
             if not self.failure:
                 segments.append(data, at=at)
-                while segments.held_bytes > self._most_bytes and len(segments.offsets) > 1:
-                    segments.drop(segments.begin)
-                self.begin, self.end = segments.begin, segments.end
+                self._trim(0)
+                self.end = segments.end
         except (StoreError, OSError) as error:
             # a record is missing from now on, so nothing may follow it: a new run continues behind the last one
             self.failure = str(error)
             log.error("capsule not written reason=%s; what follows is lost until this node starts again", error)
         finally:
-            self._waiting_bytes -= len(data)
+            self._done_bytes += len(data)
+
+    def _trim(self, needed: int) -> None:
+        segments = self._segments
+        while len(segments.offsets) > 1 and (segments.held_bytes > self._most_bytes or segments.offsets[1] <= needed):
+            segments.drop(segments.begin)
+        self.begin = segments.begin
 
 
 def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain, Segments]:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +23,7 @@ from gdp.capsule.audit import Audit
 from gdp.capsule.chain import Chain
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import BATCH_BYTES, LISTED_MAX, Ask, HolderAnswer, HolderRequest
-from gdp.capsule.record import RECORD_MAX_BYTES, Record, RecordType, split
+from gdp.capsule.record import RECORD_MAX_BYTES, Record, RecordType, number_of, split
 from gdp.closing import ClosedOnExit
 from gdp.errors import GdpError, LocalError, RemoteError, StoreError
 from gdp.names import ZERO, Name
@@ -35,12 +35,17 @@ from gdp.stores.transactions import TransactionFile
 log = logging.getLogger(__name__)
 
 _RESTS_MAX_BYTES: Final = 4 * RECORD_MAX_BYTES
+_MARKS_MAX: Final = 1_024  # in one answer
 SPARE_BYTES: Final = 256 << 20  # of the disk, for what others write
 _TABLE: Final = """
 CREATE TABLE IF NOT EXISTS checkpoints (
     capsule BLOB, offset INTEGER, number INTEGER, time_ns INTEGER, PRIMARY KEY (capsule, offset)
 ) WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS times ON checkpoints (capsule, time_ns);
+CREATE TABLE IF NOT EXISTS descriptions (
+    capsule BLOB, number INTEGER, wire BLOB, PRIMARY KEY (capsule, number)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS marks (capsule BLOB, number INTEGER, wire BLOB, PRIMARY KEY (capsule, number)) WITHOUT ROWID;
 """
 
 
@@ -151,6 +156,8 @@ class CapsuleStore(ClosedOnExit):
             capsule = self._capsules.get(request.capsule)
             if capsule is None:
                 return HolderAnswer().to_cbor()
+            if request.ask is Ask.MARKS:
+                return HolderAnswer(data=b"".join(_marks(self._index, capsule.name))).to_cbor()
             if request.ask is Ask.HEAD:
                 return HolderAnswer(head=capsule.segments.end, offset=capsule.segments.end).to_cbor()
             return self._read(capsule, request).to_cbor()
@@ -176,7 +183,15 @@ class CapsuleStore(ClosedOnExit):
                 ).fetchone()
             offset = segments.begin if found is None else found[0]
         offset, data = segments.read(offset, BATCH_BYTES)
-        return HolderAnswer(head=segments.end, offset=offset, data=data)
+        described = b""
+        if data and (request.time_ns or offset != request.offset):
+            with self._index.reading() as index:
+                row = index.execute(
+                    "SELECT wire FROM descriptions WHERE capsule = ? AND number < ? ORDER BY number DESC LIMIT 1",
+                    (capsule.name, number_of(data)),
+                ).fetchone()
+            described = b"" if row is None else row[0]
+        return HolderAnswer(head=segments.end, offset=offset, data=data, described=described)
 
     def _append(self, request: HolderRequest, client: Name) -> HolderAnswer:
         capsule = self._capsules.get(request.capsule) or self._create(request, client)
@@ -208,15 +223,15 @@ class CapsuleStore(ClosedOnExit):
         come = data if gap_end is not None else capsule.rest + data
         begin = segments.end if gap_end is None else gap_end
         files, at = [0], 0  # where files begin in ``come``
-        rows = list[tuple[Name, int, int, int]]()
+        found = list[tuple[int, Record, bytes]]()
         file_at = segments.last - begin if gap_end is None and segments.offsets else 0
         for wire in split(come):
             record = chain.handle_record(wire, may_skip=gap_end is not None and not at)
-            if record.type is RecordType.CHECKPOINT:
-                rows.append((capsule.name, begin + at, record.number, record.time_ns))
-                if at - file_at >= SEGMENT_BYTES:
-                    files.append(at)
-                    file_at = at
+            if record.type is not RecordType.MESSAGE:
+                found.append((begin + at, record, wire))
+            if record.type is RecordType.CHECKPOINT and at - file_at >= SEGMENT_BYTES:
+                files.append(at)
+                file_at = at
             at += len(wire)
         if gap_end is not None and not at:
             raise LocalError(f"{capsule.name.short}: a gap ends with a whole checkpoint")
@@ -225,7 +240,7 @@ class CapsuleStore(ClosedOnExit):
             if end > first:
                 segments.append(come[first:end], at=begin + first if is_new else None)
         capsule.chain, capsule.rest = chain, come[at:]
-        self._put(rows)
+        self._put(capsule.name, found)
 
     def _create(self, request: HolderRequest, client: Name) -> StoredCapsule:
         descriptor = request.descriptor
@@ -280,18 +295,40 @@ class CapsuleStore(ClosedOnExit):
             size = capsule.segments.size_of(offset)
             if last is not None and offset + size <= last:
                 continue
-            rows, at = list[tuple[Name, int, int, int]](), offset
+            found, at = list[tuple[int, Record, bytes]](), offset
             for wire in split(capsule.segments.read(offset, size)[1]):
                 record = Record.from_wire(wire)
-                if record.type is RecordType.CHECKPOINT:
-                    rows.append((capsule.name, at, record.number, record.time_ns))
+                if record.type is not RecordType.MESSAGE:
+                    found.append((at, record, wire))
                 at += len(wire)
-            self._put(rows)
+            self._put(capsule.name, found)
 
-    def _put(self, rows: list[tuple[Name, int, int, int]]) -> None:
-        if rows:
-            with self._index.writing() as index:
-                index.executemany("INSERT OR REPLACE INTO checkpoints VALUES (?, ?, ?, ?)", rows)
+    def _put(self, capsule: Name, found: list[tuple[int, Record, bytes]]) -> None:
+        """Index checkpoints, by their offsets, and descriptions and marks, which outlive their segment."""
+        if not found:
+            return
+        places = [(capsule, at, of.number, of.time_ns) for at, of, _ in found if of.type is RecordType.CHECKPOINT]
+        described = [(capsule, of.number, wire) for _, of, wire in found if of.type is RecordType.DESCRIPTION]
+        marks = [(capsule, of.number, wire) for _, of, wire in found if of.type is RecordType.MARK]
+        with self._index.writing() as index:
+            index.executemany("INSERT OR REPLACE INTO checkpoints VALUES (?, ?, ?, ?)", places)
+            index.executemany("INSERT OR REPLACE INTO descriptions VALUES (?, ?, ?)", described)
+            index.executemany("INSERT OR REPLACE INTO marks VALUES (?, ?, ?)", marks)
+
+
+def _marks(index: TransactionFile, name: Name) -> list[bytes]:
+    """Return the records of the latest marks of a capsule, as many as an answer may have, in order."""
+    query = "SELECT wire FROM marks WHERE capsule = ? ORDER BY number DESC LIMIT ?"
+    with index.reading() as open_index:
+        found = [row[0] for row in open_index.execute(query, (name, _MARKS_MAX))]
+    sizes = accumulate(map(len, found))
+    return [wire for wire, size in zip(found, sizes, strict=True) if size <= BATCH_BYTES][::-1]
+
+
+def marks_of(folder: Path, name: Name) -> list[Record]:
+    """Return the latest marks of a capsule in a store. Raises ``StoreError``: the index cannot be read."""
+    with TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL") as index:
+        return [Record.from_wire(wire) for wire in _marks(index, name)]
 
 
 def _refuse_others(descriptor: Descriptor, client: Name) -> None:

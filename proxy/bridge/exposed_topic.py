@@ -196,6 +196,8 @@ class ExposedTopic:
         if publisher is None:
             return  # the description always comes first: an earlier message belongs to a subscription that was replaced
         self.taken += 1
+        if self._context.keeper is not None:
+            self._context.keeper.handle_event(self._flow_spec.local, self._context.faults)
         if self.last_s is None and self._dispatcher.endpoint.is_live:
             publisher.await_readers(now_s + READER.lease_s)  # the path to readers that wait may come later
         self.last_s = now_s

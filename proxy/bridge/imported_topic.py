@@ -246,6 +246,8 @@ class ImportedTopic:
             self._refuse(Fault.TOO_LARGE, detail)
             return
         self._output.publish(handle, raw, Origin(ros_message.stamp_ns, delivered.sequence))
+        if self._context.keeper is not None:
+            self._context.keeper.handle_event(self._flow_spec.local, self._context.faults)
         differs = clock is not None and clock.least_s > 0  # else the bound lets both be equal, and one time stays so
         latency_ms = (time.time_ns() - ros_message.stamp_ns + (ahead_ns if differs else 0)) / 1e6
         self.stats.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)

@@ -1,4 +1,4 @@
-"""Keeping of exposed topics in capsules, by the delegations of this proxy.
+"""Keeping of exposed topics in capsules, by the delegations of this proxy, and the events around which they are kept.
 
 I/O, by its rings.
 """
@@ -6,19 +6,23 @@ I/O, by its rings.
 from __future__ import annotations
 
 import secrets
+import time
 from pathlib import Path
+from typing import Final
 
 from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.crypto.identity import Identity
-from gdp.errors import GdpError, LocalError
+from gdp.errors import GdpError, LocalError, StoreError
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.sansio import Timestamps
 from gdp.session.keeping import CapsuleKeeper
 from gdp.trust.right import Right
 from proxy.bridge.faults import Fault, Faults
-from proxy.config.keep import Keep
+from proxy.config.keep import UPLINK_LOST, Keep
+
+_EVENTS: Final = (UPLINK_LOST, *(each.value for each in Fault if each is not Fault.NOT_KEPT))
 
 
 class TopicKeeper:
@@ -37,16 +41,41 @@ class TopicKeeper:
         self._held = held
         self._local: dict[Name, str] = {}  # names of the topics that are kept
         self._failing: set[Name] = set()
+        self._when: dict[str, set[Name]] = {}  # topics that each event marks
+        self._fault_counts: dict[str, int] = {}
+        self._was_attached = False
         self.capsules = CapsuleKeeper(member, identity, folder, start=secrets.randbits(63))
 
     def keep(self, local: str, topic: Topic, publisher: Publisher, keep: Keep, unix_s: float) -> str:
         """Keep what the publisher of a local name publishes; return why that is not possible, empty if it is."""
         self._local[topic.name] = local
         try:
-            self.capsules.keep(topic, publisher, self._holder(keep.to), keep.disk, unix_s)
+            for event in keep.when:
+                if not event.startswith("/") and event not in _EVENTS:
+                    raise LocalError(f"keep: when: {event} is no event; expected a topic or {', '.join(_EVENTS)}")
+                self._when.setdefault(event, set()).add(topic.name)
+            self.capsules.keep(topic, publisher, self._holder(keep.to), keep.disk, unix_s, keep.around_ns)
         except GdpError as error:
             return str(error)
         return ""
+
+    def mark(self, name: str, unix_s: float) -> int:
+        """Mark an event in all topics that are kept; return how many. Raises ``StoreError``: a disk refuses."""
+        return self._mark(name, set(self.capsules.topics), unix_s)
+
+    def handle_event(self, event: str, faults: Faults) -> None:
+        """Mark an event in the topics whose rule states it: a message of a local topic, or another one."""
+        if event in self._when:
+            try:
+                self._mark(event, self._when[event], time.time())
+            except StoreError as error:
+                faults.report(event, Fault.NOT_KEPT, str(error))
+
+    def _mark(self, name: str, topics: set[Name], unix_s: float) -> int:
+        found = [kept for topic, kept in self.capsules.topics.items() if topic in topics]
+        for kept in found:
+            kept.mark(name, int(unix_s * 1e9))
+        return len(found)
 
     def release(self, topic: Name, unix_s: float) -> None:
         """Keep a topic no more."""
@@ -58,6 +87,7 @@ class TopicKeeper:
 
     def handle(self, now: Timestamps, faults: Faults) -> None:
         """Write and upload what is there, and report what is not kept or not taken by its holder."""
+        self._find_events(faults)
         self.capsules.handle(now)
         for name, kept in (*self.capsules.topics.items(), *self.capsules.ended.items()):
             for detail in kept.poll_faults():
@@ -66,6 +96,16 @@ class TopicKeeper:
             if name in self._failing and not kept.uploader.is_refused and kept.is_uploaded:
                 self._failing.remove(name)
                 faults.clear(self._local[name], Fault.NOT_KEPT)
+
+    def _find_events(self, faults: Faults) -> None:
+        is_attached = bool(self._when) and self._member.attachment.switch is not None
+        if self._was_attached and not is_attached:
+            self.handle_event(UPLINK_LOST, faults)
+        self._was_attached = is_attached
+        counts = faults.counts if self._when.keys() & set(_EVENTS[1:]) else {}
+        for word in [word for word, count in counts.items() if count > self._fault_counts.get(word, 0)]:
+            self.handle_event(word, faults)
+        self._fault_counts = dict(counts)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""

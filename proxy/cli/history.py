@@ -16,24 +16,31 @@ from typing import Annotated
 import typer
 
 from gdp.capsule.holder import HolderAnswer, HolderRequest
+from gdp.capsule.opening import NamedMark
 from gdp.cli.node import Config, Json, Logs, MemberPlane, failing_clearly
 from gdp.client.participant import Topic
 from gdp.errors import LocalError
-from gdp.session.session import Session, open_session
+from gdp.session.session import open_session
 from gdp.trust.right import Right
+from proxy.cli.replay import SkipEmpty, WaitReaders
+from proxy.cli.replay import replay as replay_recording
 from proxy.cli.tool_options import Node, print_json, print_text
 from proxy.endpoints.core.endpoint import Origin
-from proxy.node.history import PastMessage, TopicHistory, merged
+from proxy.node.history import PastMessage, TopicHistory, marks_of, merged
+from proxy.recordings.folder_writer import write_folder
 from proxy.recordings.writer import BagWriter
 
+_MARK = "mark:"
 _END_NS = (1 << 63) - 1
 _SECONDS = re.compile(r"\d+(\.\d+)?")
 
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Topics, as they were delegated, or hex digits.")]
 Store = Annotated[str, typer.Option("--holder", metavar="SERVICE", help="The holder's service.")]
-From = Annotated[str | None, typer.Option("--from", metavar="TIME", help="RFC 3339, or Unix seconds.")]
+From = Annotated[str | None, typer.Option("--from", metavar="TIME", help="RFC 3339, Unix seconds, or mark:NAME.")]
 To = Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same.")]
-Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="An .mcap file; .bag for ROS 1.")]
+Output = Annotated[
+    Path, typer.Option("--output", "-o", metavar="FILE", help="An .mcap file, .bag for ROS 1, else a folder (rosbag2).")
+]
 
 
 def export(
@@ -50,7 +57,11 @@ def export(
     Exit 1: something is damaged, missing, or closed without a grant of its epoch; it is named.
     """
     with failing_clearly():
-        is_whole = _export(names, node, holder, output, (_ns(from_, 0), _ns(to, _END_NS)), json=json)
+        is_whole, count = _export(names, node, holder, output, (from_, to), json=json)
+        if json:
+            print_json({"event": "done", "file": str(output), "messages": count})
+        else:
+            print_text(f"{count} messages are in {output}")
     raise typer.Exit(0 if is_whole else 1)
 
 
@@ -62,30 +73,45 @@ def replay(
     from_: From = None,
     to: To = None,
     rate: Annotated[float, typer.Option(min=0.0, help="1: as it was; 0: as fast as readers confirm.")] = 1.0,
+    skip_empty: SkipEmpty = None,
+    wait_readers: WaitReaders = 15.0,
     data_plane: MemberPlane = None,
     json: Json = False,
     *,
     logs: Logs,
 ) -> None:
-    """Replay what a holder has of topics onto the overlay, as ``gdp-replay`` does with a recording."""
-    from proxy.cli.replay import replay as replay_recording
+    """Replay what a holder has of topics onto the overlay, as ``gdp-replay`` does with a recording.
 
+    Exit 1: as of ``export`` and of ``gdp-replay``.
+    """
     with tempfile.TemporaryDirectory(prefix="gdp-history-") as folder:
         with failing_clearly():
             output = Path(folder) / "history.mcap"
-            _export(names, node, holder, output, (_ns(from_, 0), _ns(to, _END_NS)), json=json)
-        replay_recording(output, config, rate=rate, data_plane=data_plane, json=json, logs=logs)
+            is_whole, _ = _export(names, node, holder, output, (from_, to), json=json)
+        try:
+            replay_recording(
+                output, config, rate, skip_empty, wait_readers, data_plane=data_plane, json=json, logs=logs
+            )
+        except typer.Exit as ended:
+            raise typer.Exit(ended.exit_code or (0 if is_whole else 1)) from ended
 
 
 def _export(
-    names: Sequence[str], node: Path, holder: str, output: Path, span_ns: tuple[int, int], *, json: bool
-) -> bool:
-    """Write the recording, and report; return whether it has all."""
+    names: Sequence[str], node: Path, holder: str, output: Path, span: tuple[str | None, str | None], *, json: bool
+) -> tuple[bool, int]:
+    """Write the recording, and report; return whether it has all, and how many messages it has."""
     with open_session(node) as session:
+
+        def ask(request: HolderRequest) -> HolderAnswer:
+            return HolderAnswer.from_cbor(session.call(holder, request.to_cbor(), replication=1).payload)
+
+        topics = [session.core.resolve(name, Right.READ) for name in names]
+        is_marked = any(text is not None and text.startswith(_MARK) for text in span)
+        marks = [mark for topic in topics for mark in marks_of(ask, topic)] if is_marked else []
+        from_ns, to_ns = _ns(span[0], 0, marks), _ns(span[1], _END_NS, marks, is_end=True)
         histories = [
-            TopicHistory(lambda request: _ask(session, holder, request), topic, _name_of(topic, name), *span_ns)
-            for name in names
-            for topic in [session.core.resolve(name, Right.READ)]
+            TopicHistory(ask, topic, _name_of(topic, name), from_ns, to_ns)
+            for name, topic in zip(names, topics, strict=True)
         ]
         if not any(each.readers for each in histories):
             raise LocalError(f"{holder} has no capsule of {', '.join(names)}")
@@ -102,20 +128,23 @@ def _export(
             capsule = reader.descriptor.name.to_text()
             about = {"topic": history.name, "capsule": capsule, "signer": reader.descriptor.writer.name.to_text()}
             if json:
-                print_json({"event": "capsule", **about, "records": reader.audit.records, "problems": problems})
+                read = {
+                    "records": reader.audit.records,
+                    "left_out": sum(each.last - each.first + 1 for each in reader.left_out),
+                    "marks": [{"name": each.name, "at_ns": each.time_ns} for each in reader.opener.marks],
+                }
+                print_json({"event": "capsule", **about, **read, "problems": problems})
             else:
                 print_text(f"{history.name}: {reader.audit.records} records, signed by {about['signer']}")
-                for problem in problems:
-                    print_text(f"  {problem}")
-    if json:
-        print_json({"event": "done", "file": str(output), "messages": count})
-    else:
-        print_text(f"{count} messages are in {output}")
-    return is_whole
+                for line in [*(f"mark {each.name}" for each in reader.opener.marks), *problems]:
+                    print_text(f"  {line}")
+    return is_whole, count
 
 
 def _write(output: Path, messages: Iterator[PastMessage]) -> int:
     """Write messages into a new recording; return how many."""
+    if not output.suffix:
+        return write_folder(output, ((each.stamp_ns, each.channel, each.raw) for each in messages))
     first = next(messages, None)
     with BagWriter(output, 2 if first is None else first.channel.ros) as writer:
         for message in chain(() if first is None else (first,), messages):
@@ -124,19 +153,20 @@ def _write(output: Path, messages: Iterator[PastMessage]) -> int:
     return writer.written
 
 
-def _ask(session: Session, holder: str, request: HolderRequest) -> HolderAnswer:
-    return HolderAnswer.from_cbor(session.call(holder, request.to_cbor(), replication=1).payload)
-
-
 def _name_of(topic: Topic, name: str) -> str:
     metadata = topic.delegation.metadata
     return name if metadata is None else str(metadata.get("name", name))
 
 
-def _ns(text: str | None, otherwise: int) -> int:
-    """Return a time in Unix nanoseconds. Raises ``LocalError``: it is none."""
+def _ns(text: str | None, otherwise: int, marks: Sequence[NamedMark], *, is_end: bool = False) -> int:
+    """Return a time in Unix nanoseconds; of a mark, where its window begins or ends. Raises ``LocalError``: none."""
     if text is None:
         return otherwise
+    if text.startswith(_MARK):
+        windows = [each.window for each in sorted(marks) if each.name == text.removeprefix(_MARK)]
+        if not windows:
+            raise LocalError(f"{text}: known marks: {', '.join(sorted({each.name for each in marks})) or 'none'}")
+        return windows[-1].to_ns if is_end else windows[-1].from_ns
     if _SECONDS.fullmatch(text):
         return int(float(text) * 1e9)
     try:

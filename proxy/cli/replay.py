@@ -32,6 +32,12 @@ from proxy.recordings.reader import BagReader
 log = logging.getLogger(__name__)
 
 
+SkipEmpty = Annotated[
+    float | None,
+    typer.Option(min=0.0, metavar="SECONDS", help="Skip what a time without messages has more than this."),
+]
+WaitReaders = Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a reader of every topic.")]
+
 app = Program("gdp-replay")
 main = app.run
 
@@ -41,11 +47,8 @@ def replay(
     bag: Annotated[Path, typer.Argument(help="A ROS 1 bag, an MCAP file, a .db3 file or a rosbag2 folder.")],
     config: Config,
     rate: Annotated[float, typer.Option(min=0.0, help="1: as recorded; 0: as fast as readers confirm.")] = 1.0,
-    skip_empty: Annotated[
-        float | None,
-        typer.Option(min=0.0, metavar="SECONDS", help="Skip what a time without messages has more than this."),
-    ] = None,
-    wait_readers: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a reader of every topic.")] = 15.0,
+    skip_empty: SkipEmpty = None,
+    wait_readers: WaitReaders = 15.0,
     memory: Annotated[
         int | None,
         typer.Option(min=64, metavar="MIB", help="Memory to decode the recording; 1 to 4 GiB, by its length."),

@@ -1,4 +1,4 @@
-"""Keeping of an exposed topic: its ring on this machine's disk, and the holder of its capsule.
+"""Keeping of an exposed topic: its ring on this machine's disk, the holder of its capsule, and around what it is kept.
 
 Section of a configuration file.
 """
@@ -11,10 +11,14 @@ from typing import Annotated, Final
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
 from gdp.config.schema import Section
+from gdp.intervals import HOUR_S, MINUTE_S
 
 _UNITS: Final = {"": 1, "B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
 _SIZE: Final = re.compile(r"(\d+)\s*([A-Za-z]*)")
+_SPAN: Final = re.compile(r"\d+(\.\d+)?s")
 DISK_MIN_BYTES: Final = 1 << 20
+UPLINK_LOST: Final = "uplink-lost"
+_BEFORE_S, _AFTER_S = MINUTE_S, MINUTE_S / 2
 
 
 def read_size(value: object) -> object:
@@ -27,6 +31,22 @@ def read_size(value: object) -> object:
     return int(found[1]) * _UNITS[found[2]]
 
 
+def read_span(value: object) -> object:
+    """Return the seconds that a text such as ``60s`` states; another value is passed on."""
+    return float(value[:-1]) if isinstance(value, str) and _SPAN.fullmatch(value) else value
+
+
+def _listed(value: object) -> object:
+    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+
+
+Span = Annotated[
+    float | None,
+    BeforeValidator(read_span),
+    WithJsonSchema({"anyOf": [{"type": "number", "minimum": 0}, {"type": "string", "pattern": _SPAN.pattern}]}),
+]
+
+
 class Keep(Section):
     """What is kept of a topic, and who holds it."""
 
@@ -35,4 +55,24 @@ class Keep(Section):
         BeforeValidator(read_size),
         WithJsonSchema({"anyOf": [{"type": "integer", "minimum": DISK_MIN_BYTES}, {"type": "string"}]}),
     ] = Field(default=10**9, ge=DISK_MIN_BYTES, description="Most bytes that wait here, such as `2GB`.")
+    before: Span = Field(
+        default=None, ge=0, le=HOUR_S, description="Time before an event, such as `60s`; only windows are uploaded."
+    )
+    after: Span = Field(default=None, ge=0, le=HOUR_S, description="Time after an event.")
+    when: Annotated[
+        tuple[str, ...],
+        BeforeValidator(_listed),
+        WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}),
+    ] = Field(
+        default=(),
+        description="Events: a message of a topic that a rule names (`/estop`), `uplink-lost`, or a fault's word.",
+    )
     to: str = Field(min_length=1, description="The holder's service, as `gdp delegate` named it, or 64 hex digits.")
+
+    @property
+    def around_ns(self) -> tuple[int, int] | None:
+        """Return what is kept before and after an event, in nanoseconds; None: everything is kept."""
+        if self.before is None and self.after is None and not self.when:
+            return None
+        before_s = _BEFORE_S if self.before is None else self.before
+        return int(before_s * 1e9), int((_AFTER_S if self.after is None else self.after) * 1e9)

@@ -1,4 +1,4 @@
-"""Answer of a proxy to the diagnostic request ``control``: who holds the control of a topic, and who is to hold it.
+"""Answers of a proxy: to ``control``, who holds the control of a topic, and who is to hold it; to ``mark``, an event.
 
 I/O: it logs. A publisher of the topic may take control: this proxy has verified its right with its advertisement. The
 holder may give it, and so may this node itself. Who asks signs, and states the generation of control that it has seen:
@@ -13,7 +13,8 @@ from typing import Final
 
 from gdp.control.diagnostics import Question
 from gdp.crypto.schema import FLAG, Keyed, text, uint
-from gdp.errors import LocalError
+from gdp.errors import LocalError, StoreError
+from gdp.limits import MARK_MAX_CHARS
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from proxy.bridge.bridge import Bridge
@@ -26,6 +27,8 @@ from proxy.node.proxy_state import ProxyState
 log = logging.getLogger(__name__)
 
 ASK: Final = "control"
+MARK: Final = "mark"
+_NAME: Final = Keyed("mark", text(MARK_MAX_CHARS))
 _LABEL_MAX_CHARS: Final = 256
 _SHOW: Final = "show"
 _ACT: Final = Keyed("do", text(8), absent=_SHOW)
@@ -56,6 +59,17 @@ def answer_control(state: ProxyState, bridge: Bridge) -> None:
         return {**control_row(flow, control, now.mono_s), "generation": control.generation, "error": error}
 
     state.member.diagnostics.register(ASK, answer, for_foreign=True)
+
+
+def answer_mark(state: ProxyState, question: Question, now: Timestamps) -> Mapping[str, object]:
+    """Mark an event, for this node itself."""
+    keeper = state.context.keeper
+    if question.asker.name != state.identity.name or keeper is None:
+        return {}
+    try:
+        return {"topics": keeper.mark(_NAME.read(question.body), now.unix_s)}
+    except StoreError as error:
+        return {"error": str(error)}
 
 
 def _act(act: str, flow: ImportedTopic, control: ExclusiveControl, question: Question, now_s: float, own: Name) -> None:

@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
-from gdp.capsule.opening import Kept
+from gdp.capsule.opening import CapsuleOpener, Kept, NamedMark
 from gdp.capsule.reading import CapsuleReader
+from gdp.capsule.record import Record, split
 from gdp.client.participant import Topic
 from gdp.errors import GdpError
 from gdp.limits import MESSAGE_MAX_BYTES
@@ -91,6 +92,17 @@ class TopicHistory:
         expander, decoder = ready[min(message.channel, len(ready) - 1)]
         raw = decoder.decode(*expander.expand(message))
         return PastMessage(message.stamp_ns, decoder.target, raw, kept.sequence)
+
+
+def marks_of(ask: AskHolder, topic: Topic) -> list[NamedMark]:
+    """Return the latest marks of a topic, of all its writers."""
+    marks = list[NamedMark]()
+    for each in ask(HolderRequest(ask=Ask.LIST, topic=topic.name)).descriptors:
+        opener = CapsuleOpener(topic.name, each.writer.name, topic.secrets, each.key)
+        for wire in split(ask(HolderRequest(ask=Ask.MARKS, capsule=each.name)).data):
+            opener.open(Record.from_wire(wire))
+        marks += opener.marks
+    return marks
 
 
 def merged(histories: Iterable[TopicHistory]) -> Iterator[PastMessage]:

@@ -211,6 +211,8 @@ class Replay:
         """
         progress, stalled_s = (self.confirmed, self.sent_best_effort, 0), time.monotonic()
         kept = None if self._keeper is None else self._keeper.capsules
+        if kept is not None:
+            kept.flush(time.time())
         while any(each.publisher.is_wanted and not each.publisher.is_acknowledged() for each in self.topics) or (
             kept is not None and not kept.is_uploaded
         ):

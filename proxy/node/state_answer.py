@@ -1,10 +1,11 @@
-"""Answer of a proxy to the diagnostic request ``state``: its flows of one name.
+"""Answer of a proxy to the diagnostic requests ``state``, its flows of one name, and ``mark``.
 
 I/O through the bridge, which it only reads. ``gdp/state/state_answers.py`` says who gets an answer.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from gdp.control.diagnostics import Question
@@ -13,6 +14,7 @@ from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.state.state_answers import answer_state
 from proxy.bridge.bridge import Bridge
+from proxy.node.control_answer import MARK, answer_mark
 from proxy.node.proxy_state import ProxyState
 
 if TYPE_CHECKING:
@@ -52,3 +54,4 @@ def answer_for_proxy(state: ProxyState, bridge: Bridge) -> None:
         return readers | {each.publisher for each in member.subscriptions.writer_proxies_of(name)}
 
     answer_state(member.diagnostics, policy, gather, holders)
+    member.diagnostics.register(MARK, partial(answer_mark, state))

@@ -57,7 +57,7 @@ class McapWriter:
             definition = channel.definition.encode("utf-8", "replace")
             words = _text(channel.type_name) + _text(_ENCODINGS[channel.definition_format])
             self._describe(Opcode.SCHEMA, struct.pack("<H", self._schemas[key]) + words + _sized(definition))
-        about = {"offered_qos_profiles": _offered(channel), "topic_type_hash": channel.hash}
+        about = {"offered_qos_profiles": offered(channel), "topic_type_hash": channel.hash}
         head = struct.pack("<HH", self._channels, self._schemas[key])
         self._describe(Opcode.CHANNEL, head + _text(channel.topic) + _text("cdr") + _map(about))
         self._counts[self._channels] = 0
@@ -175,7 +175,8 @@ def _map(items: Mapping[str, str]) -> bytes:
     return _sized(b"".join(_text(key) + _text(value) for key, value in items.items()))
 
 
-def _offered(channel: Channel) -> str:
+def offered(channel: Channel) -> str:
+    """Return the offered profiles as rosbag2 writes them; empty: there are none."""
     if not channel.qos:
         return ""
     from ruamel.yaml import YAML

@@ -11,6 +11,7 @@ from typing import Any
 
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
 from gdp.capsule.opening import CapsuleOpener, Kept
+from gdp.capsule.reading import CapsuleReader
 from gdp.capsule.record import Record, split
 from gdp.client.participant import Participant
 from gdp.errors import GdpError
@@ -101,6 +102,7 @@ class Keeping:
     flow: Flow
     folder: Path
     most_bytes: int = 1 << 24
+    around_ns: tuple[int, int] | None = None
     keeper: CapsuleKeeper = field(init=False)
     kept: KeptTopic = field(init=False)
     worked_s: float = 0.0
@@ -111,7 +113,9 @@ class Keeping:
         self.keeper = CapsuleKeeper(member, identity, self.folder, start=7, pool=Inline())
         service = world.topic(STORE, member, [Right.CALL], kind="service")
         unix_s = world.network.now.unix_s
-        self.kept = self.keeper.keep(self.flow.topic, self.flow.publisher, service, self.most_bytes, unix_s)
+        self.kept = self.keeper.keep(
+            self.flow.topic, self.flow.publisher, service, self.most_bytes, unix_s, self.around_ns
+        )
 
     def work(self) -> None:
         """Write and upload."""
@@ -163,6 +167,16 @@ def records_at(store: CapsuleStore, capsule: Name, *, time_ns: int = 0) -> bytes
             return b"".join(pieces)
         pieces.append(answer.data)
         offset = answer.offset + len(answer.data)
+
+
+def read_from(holder: Holder, keeping: Keeping, from_ns: int = 0) -> tuple[list[Kept], CapsuleReader]:
+    """Return what a reader with the topic's secrets gets from a holder, and the reader."""
+    reader = CapsuleReader(keeping.kept.ring.descriptor, keeping.flow.topic.secrets, from_ns=from_ns)
+    kept = list[Kept]()
+    while not reader.is_done:
+        answer = holder.store.handle(reader.next_request().to_cbor(), Name(b"r" * 32))
+        kept += reader.handle_response(HolderAnswer.from_cbor(answer))
+    return kept, reader
 
 
 def opened(data: bytes, keeping: Keeping) -> list[Kept]:

@@ -17,7 +17,7 @@ from gdp.capsule.record import Record, RecordType, split
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import HOPS_AT
 from gdp.stores.capsule_store import stored
-from tests.journeys.capsules import Holder, Keeping, opened, records_at
+from tests.journeys.capsules import Holder, Keeping, opened, read_from, records_at
 from tests.journeys.flows import ROBOT, Tap, advertise, flowing, ring
 
 
@@ -147,8 +147,21 @@ def test_what_the_ring_dropped_is_named_by_number(tmp_path: Path) -> None:
     assert held | missing == set(range(max(held) + 1))
     assert not held & missing
     assert any("never had" in each for each in keeping.kept.poll_faults())
-    sequences = {each.sequence for each in opened(records_at(holder.store, keeping.kept.name), keeping)}
-    assert {1, 240} <= sequences
+    kept = opened(records_at(holder.store, keeping.kept.name), keeping)
+    assert {1, 240} <= {each.sequence for each in kept}
+    assert {each.description for each in kept} == {b"described"}
+
+
+def test_a_span_of_time_has_its_description(tmp_path: Path) -> None:
+    keeping, holder = holding(tmp_path)
+    began_ns = int(keeping.flow.world.network.now.unix_s * 1e9)
+    keeping.publish_at([0.05 * each for each in range(160)], lambda each: bytes(2_000) + b"%d" % each)
+    keeping.run(9, holder)
+    assert keeping.run(20, holder, until=keeping.is_uploaded)
+    kept, reader = read_from(holder, keeping, from_ns=began_ns + 6_000_000_000)
+    assert (reader.audit.findings, reader.lost) == ([], [])
+    assert 30 <= len(kept) <= 50
+    assert {each.description for each in kept} == {b"described"}
 
 
 def test_a_large_message_takes_several_batches(tmp_path: Path) -> None:

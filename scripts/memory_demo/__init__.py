@@ -1,0 +1,1 @@
+"""Demonstration of a robot's memory; ``scripts/memory_demo.sh`` runs it."""

@@ -1,0 +1,60 @@
+"""Uploads yield: what a robot sends live waits little for the history that an outage has left."""
+
+from __future__ import annotations
+
+import statistics
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from tests.journeys.capsules import Holder, Keeping
+from tests.journeys.flows import ROBOT, SERVER, advertise, ring
+
+UPLINK_BYTES_S = 1_250_000
+IMAGE_BYTES = 40_000
+ALONE_S = 0.043  # an image at this rate, as a loop of 5 ms sees it
+
+
+@pytest.mark.parametrize(("backlog", "ring_bytes"), [(False, 1 << 28), (True, 1 << 28), (True, 1 << 24)])
+def test_a_live_image_waits_little_for_an_upload_unless_the_ring_fills(
+    tmp_path: Path, backlog: bool, ring_bytes: int
+) -> None:
+    world = ring()
+    world.add_member("nuc3/store", "nuc3")
+    assert world.run_until_attached()
+    keeping = Keeping(advertise(world), tmp_path / "robot", ring_bytes)
+    holder = Holder(world, tmp_path / "holder", "nuc3/store")
+    camera = advertise(world, "/camera", reliable=False)
+    camera.read_by(SERVER)
+    assert world.network.run(5, lambda: camera.is_read_by(1))
+    world.leads[ROBOT].bytes_s, world.leads[ROBOT].fifo_s = UPLINK_BYTES_S, 0.5
+    if backlog:
+        for _ in range(120):
+            keeping.flow.publish(bytes(IMAGE_BYTES))
+    sent_s, ages_s = dict[bytes, float](), list[float]()
+
+    def shoot(number: int) -> None:
+        sent_s[b"%4d" % number] = world.network.now.mono_s
+        camera.publish(b"%4d" % number + bytes(IMAGE_BYTES))
+
+    def arrived() -> bool:
+        now_s = world.network.now.mono_s
+        found = [each for each in world.members[SERVER].poll_messages() if each.topic == camera.topic.name]
+        ages_s.extend(now_s - sent_s[each.delivered.message[:4]] for each in found)
+        return False
+
+    for number in range(30):
+        world.network.call(1.0 + number / 10, partial(shoot, number))
+    keeping.run(3.9, holder, until=arrived)
+    assert len(ages_s) >= 28
+    left = keeping.kept.ring.end - keeping.kept.uploader.confirmed
+    assert (left > 1_000_000) is backlog
+    assert keeping.kept.uploader.confirmed > (500_000 if backlog else 0)
+    if ring_bytes == 1 << 24:
+        assert left < 1.1 * ring_bytes / 8
+    else:
+        assert not backlog or left > 1.1 * (1 << 24) / 8
+        assert statistics.median(ages_s) < (1.4 if backlog else 1.1) * ALONE_S
+    keeping.run(5, holder)
+    assert keeping.run(20, holder, until=keeping.is_uploaded)
