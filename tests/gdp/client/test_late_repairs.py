@@ -240,7 +240,7 @@ def test_replayed_frames_start_no_request_and_no_wait() -> None:
     old = [frame for frame in pipe.seen if decode(frame).kind == Kind.DATA]
     before = requests(pipe)
     for frame in old:
-        end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+        end.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
     pipe.run(0.5)
     assert requests(pipe) == before > 0
     assert pipe.publisher.protection.repairs == 5
