@@ -32,7 +32,7 @@ from typing import Any, Final, NamedTuple
 ROOT: Final = Path(__file__).parents[1]
 PACKAGES: Final = ("gdp/switch", "gdp/rib", "gdp/client", "gdp/message", "gdp/crypto", "gdp/trust", "proxy/bridge")
 STAGES: Final = ("own", "golden", "others")  # tests of the package, golden traces, all others in memory
-_LANE: Final = ("tests/attacks", "tests/journeys", "tests/golden", "tests/gdp", "tests/proxy")
+_LANE: Final = ("tests/attacks", "tests/journeys", "tests/golden", "tests/gdp", "tests/gdp_extensions", "tests/proxy")
 _NOTES: Final = "GDP_MUTANTS"  # file in which a run notes what its tests do
 _LIMIT: Final = "GDP_MUTANTS_LIMIT"  # seconds of a test
 _COMPARED: Final[dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]]] = {
