@@ -130,12 +130,15 @@ def _changes(parent: ast.AST, field: str, node: ast.expr | ast.stmt) -> Iterator
 def drawn(count: int, seed: int) -> list[Row]:
     """Return mutants: a file by its lines, then one of its changes; ``site`` is its number among them."""
     random, rows = Random(seed), list[Row]()
-    texts = {each: each.read_text() for package in PACKAGES for each in sorted((ROOT / package).rglob("*.py"))}
-    sites = {each: found for each, text in texts.items() if (found := list(_sites(ast.parse(text))))}
+    files = [each for package in PACKAGES for each in sorted((ROOT / package).rglob("*.py")) if each.stem != "__init__"]
+    lines = [each.read_text().count("\n") for each in files]
     while len(rows) < count:
-        file = random.choices(list(sites), [texts[each].count("\n") for each in sites])[0]
-        number = random.randrange(len(sites[file]))
-        site = sites[file][number]
+        (file,) = random.choices(files, lines)
+        sites = list(_sites(ast.parse(file.read_text())))
+        if not sites:
+            continue
+        number = random.randrange(len(sites))
+        site = sites[number]
         row = {"file": str(file.relative_to(ROOT)), "line": site.node.lineno, "change": site.change, "site": number}
         rows += [row] if row not in rows else []
     return rows
