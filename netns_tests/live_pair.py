@@ -30,8 +30,7 @@ from gdp.crypto.certificates import Role
 from gdp.host.run_registry import Run
 from gdp.stores.keyring import load_identity
 from lab.credentials import Carried, Kind, OverlayCredentials, Side
-from lab.machine import LabMachine
-from lab.namespaces import Namespaces
+from lab.machines import Lab, OverlayNodes
 from lab.process import LabProcess, new_run, python_path
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
@@ -84,26 +83,13 @@ class Crossing:
         return Carried(self.name, self.type_name, self.kind, self.options)
 
 
-class Ros1Node(Peer):
-    """Real rospy node; ``live_nodes`` lists its commands."""
-
-    def __init__(self, name: str, words: Sequence[str], environment: Mapping[str, str]) -> None:
-        self._process = subprocess.Popen(
-            [*words, sys.executable, str(Path(__file__).with_name("live_nodes.py")), name],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # rospy's retry delay while a master is away
-            text=True,
-            env={**os.environ, **environment},
-        )
-
-
 class Proxy:
-    """``gdp-proxy`` process that can be killed and started again."""
+    """``gdp-proxy`` process at a ``machine``, which can be killed and started again."""
 
     def __init__(self, pair: Pair, label: str) -> None:
         self._pair = pair
         self._label = label
+        self.machine = "a" if label == "a" else "b"
         self._process: LabProcess | None = None
         self._port = 9_110 + list(_GRAPHS).index(label)
 
@@ -117,11 +103,6 @@ class Proxy:
     def is_running(self) -> bool:
         """Return whether it was started and has not ended."""
         return self._process is not None
-
-    @property
-    def machine(self) -> str:
-        """Return where it runs."""
-        return "a" if self._label == "a" else "b"
 
     @property
     def node_name(self) -> str:
@@ -174,24 +155,18 @@ class Pair:
 
     def __init__(self, run: Run, undo: ExitStack, crossings: Sequence[Crossing], hidden: Mapping[str, str]) -> None:
         self.folder = run.directory
-        self.spaces = Namespaces(_TOPOLOGY, run)
+        lab = Lab(run, _TOPOLOGY)
+        self.spaces, self.machines = lab.namespaces, lab.machines
         self._undo = undo
-        self.machines = {
-            each: undo.enter_context(LabMachine(self.folder, self.spaces[each].command([]), run=run))
-            for each in _TOPOLOGY.nodes
-        }
         for each in self.machines.values():
-            each.environment |= {**_ENVIRONMENT, "ROS_LOG_DIR": str(self.folder / "ros")}
+            undo.enter_context(each).environment |= {**_ENVIRONMENT, "ROS_LOG_DIR": str(self.folder / "ros")}
         self._crossings = crossings
         self._hidden = hidden
         self._proxies = {label: Proxy(self, label) for label in _GRAPHS}
         self._master: LabProcess | None = None
         self._nodes: dict[str, Peer] = {}
         self._credentials = OverlayCredentials(_TOPOLOGY, self.folder, lease_s=LEASE_S)
-        for machine in _TOPOLOGY.nodes:
-            self.machines[machine].start("switch", self._credentials.switch(machine, "auto").stem)
-        (rib,) = _TOPOLOGY.attached("rib")
-        self.machines[rib.switch].start("rib", self._credentials.rib(rib).stem)
+        undo.enter_context(OverlayNodes(lab, self._credentials)).stand_up(_TOPOLOGY.nodes, "auto")
 
     def proxy(self, label: str) -> Proxy:
         """Return a running proxy."""
@@ -228,7 +203,7 @@ class Pair:
         """Start the ROS 1 master, if it does not run."""
         if self._master is None:
             need_ros1()
-            argv = [sys.executable, "-m", "ring.nodes.master", _MASTER.rpartition(":")[2]]
+            argv = [sys.executable, "-m", "ring.nodes", "1", "master", _MASTER.rpartition(":")[2]]
             self._master = self.machines["b"].launch(argv, "master")
             self._master.read_until("ready", patience_s=PATIENCE_S)
 
@@ -272,7 +247,9 @@ class Pair:
         words = [*self.spaces[machine].command([]), *self._environment(graph)]
         if graph == "one":
             logs = {"ROS_LOG_DIR": str(self.folder / "ros"), "PYTHONPATH": python_path(Path(need_ros1()))}
-            node: Peer = Ros1Node(name, words, {**_ENVIRONMENT, **logs})
+            program = Path(__file__).with_name("live_nodes.py")
+            # of its errors most are rospy's retries while a master is away
+            node = Peer(name, words, {**_ENVIRONMENT, **logs}, program, subprocess.DEVNULL)
         else:
             node = Peer(name, words, _ENVIRONMENT)
         self._undo.callback(node.end)

@@ -8,13 +8,14 @@ from typing import Final
 
 import yaml
 
+from fog.bootstrap.bundles import gateway_boot
+from fog.bootstrap.members import Authority
 from fog.hardware import Hardware, Offer
 from fog.machine import Machine, MachineBundle, MachineSpec, MachineState, Program
 from fog.providers.local.netlinks import UP
 from fog.providers.local.provider import LocalProvider
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
-from gdp.names import Name
 from gdp.stores.issue import delegate, install_delegation, make_node
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
@@ -81,10 +82,11 @@ class Domain:
         self._folder = folder
         self._robot = LabMachine(folder / "robot")
         make_nodes(folder, {})
+        self._authority = Authority(folder / "domain", folder / "owner")
 
     def gateway(self, label: str, ifaces: Sequence[str]) -> MachineBundle:
         """Return the nodes of a gateway."""
-        return MachineBundle(self._switch(label, ifaces), (_command("switch", "gdp.cli.switch"),))
+        return gateway_boot(self._authority, label, ifaces, days=1)
 
     def machine(self, name: str) -> MachineBundle:
         """Return the nodes of a machine: a switch, and a proxy without flows."""
@@ -99,9 +101,9 @@ class Domain:
         """Return the nodes of a serving machine that may be its group's gateway: a switch and a participant."""
         ports = [{"iface": "eth0"}, {"iface": UP, "optional": True}]
         files = self._node(Role.SWITCH, name, {"ports": ports, "attach": ["proxy0"]})
-        keys, served = self._member(name, service, Right.SERVE)
+        keys = self._member(name, service, Right.SERVE)
         files |= {f"proxy/{path.relative_to(keys)}": path.read_bytes() for path in keys.rglob("*") if path.is_file()}
-        words = (served.to_text(), "{home}/proxy", "{home}/switch/root.crt", "proxy0", "serve")
+        words = ("{home}/proxy", "{home}/switch/root.crt", "proxy0", "serve")
         wait = 'until ip link show proxy0 >/dev/null 2>&1; do sleep 0.05; done; exec "$@"'
         member = ("env", f"PYTHONPATH={python_path()}", "sh", "-c", wait, "member")  # a machine has no tests
         program = Program("proxy", (*member, "{python}", *calling(uplink_child.main, *words)[1:]), "up")
@@ -114,10 +116,9 @@ class Domain:
 
     def start_client(self, iface: str, service: Metadata, requests: int, size: int) -> LabProcess:
         """Start a participant at the robot's switch that calls on command; see ``uplink_child``."""
-        keys, name = self._member("client", service, Right.CALL)
-        root = self._folder / "domain" / ROOT_CERTIFICATE
-        words = [name.to_text(), str(keys), str(root), iface, "call", str(requests), str(size)]
-        client = self._robot.launch(calling(uplink_child.main, *words), "client", has_orders=True)
+        keys, root = self._member("client", service, Right.CALL), self._folder / "domain" / ROOT_CERTIFICATE
+        argv = calling(uplink_child.main, keys, root, iface, "call", requests, size)
+        client = self._robot.launch(argv, "client", has_orders=True)
         assert client.read_line(PATIENCE_S) == b"up"
         return client
 
@@ -125,21 +126,18 @@ class Domain:
         """End the robot's side."""
         self._robot.close()
 
-    def _member(self, label: str, service: Metadata, right: Right) -> tuple[Path, Name]:
-        keys, owner = self._folder / f"member-{label}", self._folder / "owner"
+    def _member(self, label: str, service: Metadata, right: Right) -> Path:
+        keys = self._folder / f"member-{label}"
         make_node(keys, Role.PROXY, label, self._folder / "domain")
-        given = delegate(owner, keys / CARD, service, [right])
-        install_delegation(keys, given)
-        return keys, given.name
+        install_delegation(keys, delegate(self._folder / "owner", keys / CARD, service, [right]))
+        return keys
 
     def _switch(self, label: str, ifaces: Sequence[str], attach: Sequence[str] = ()) -> dict[str, bytes]:
         ports = [{"iface": iface} for iface in ifaces]
         return self._node(Role.SWITCH, label, {"ports": ports, "attach": list(attach)})
 
     def _node(self, role: Role, label: str, content: Mapping[str, object]) -> dict[str, bytes]:
-        keys = self._folder / f"{role.value}-{label}"
-        make_node(keys, role, label, self._folder / "domain")
-        files = {f"{role.value}/{path.name}": path.read_bytes() for path in keys.iterdir()}
+        files = self._authority.enrol(role, label, role.value, days=1)
         reported = {"identity": role.value, "domain": {"root": f"{role.value}/root.crt"}, **content}
         return {**files, f"{role.value}.yaml": yaml.safe_dump(reported).encode()}
 

@@ -15,13 +15,13 @@ _PATIENCE_S = 400.0
 _NEEDS = {
     "availability": ("matplotlib",),
     "table1": ("matplotlib",),
-    "fig4": ("rclpy", "pupil_apriltags", "scipy", "matplotlib"),
+    "fig4": ("rclpy", "cv2", "scipy", "matplotlib"),
     "fig5": ("rclpy", "ompl", "fcl", "trimesh", "collada", "scipy", "matplotlib"),
     "fig6": ("rclpy", "scipy", "matplotlib"),
     "fig7": ("rclpy", "scipy", "matplotlib"),
     "fig6 --compute": ("rclpy", "scipy", "matplotlib", "rapidocr_onnxruntime"),
     "fig7 --compute": ("rclpy", "scipy", "matplotlib", "rapidocr_onnxruntime"),
-    "fig9": ("rclpy", "pupil_apriltags", "scipy", "matplotlib"),
+    "fig9": ("rclpy", "cv2", "scipy", "matplotlib"),
     "outages": ("rclpy", "matplotlib"),
     "offload": ("rclpy", "cyclonedds", "cv2", "scipy", "matplotlib"),
 }

@@ -12,7 +12,7 @@ import pytest
 
 import gdp
 from gdp.trust.right import Right
-from internet_demo.stage import Stage
+from internet_demo.scenario import Stage
 from lab.internet.laboratory import Laboratory
 from lab.process import until
 

@@ -70,9 +70,9 @@ class Field:
     def member(self, switch: str, right: Right, *load: int) -> LabProcess:
         """Start a participant at a switch without waiting for it."""
         credentials = self._credentials
-        name = credentials.delegate(switch, SERVICE, right).to_text()
+        credentials.delegate(switch, SERVICE, right)
         root = credentials.domain("field") / ROOT_CERTIFICATE
-        where = (name, credentials.identity(Role.PROXY, switch), root, "member")
+        where = (credentials.identity(Role.PROXY, switch), root, "member")
         argv = calling(uplink_child.main, *where, right.value, *load)
         self._starting.append(self._machines[switch].launch(argv, f"member-{switch}", has_orders=right is Right.CALL))
         return self._starting[-1]

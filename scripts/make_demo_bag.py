@@ -34,14 +34,14 @@ MAP_CELL_M: Final = 0.05
 Fields = Mapping[str, Any]
 
 IMAGES: Final = "/camera/image"
-TYPES: Final = {  # topic: type, messages a second (0: one, latched)
-    "/tf_static": ("tf2_msgs/msg/TFMessage", 0),
-    "/map": ("nav_msgs/msg/OccupancyGrid", 0),
-    IMAGES: ("sensor_msgs/msg/Image", 10),
-    "/scan": ("sensor_msgs/msg/LaserScan", 10),
-    "/imu": ("sensor_msgs/msg/Imu", 100),
-    "/odom": ("nav_msgs/msg/Odometry", 20),
-    "/tf": ("tf2_msgs/msg/TFMessage", 20),
+TYPES: Final = {  # topic: type, messages a second (0: one, latched), method of ``Drive``
+    "/tf_static": ("tf2_msgs/msg/TFMessage", 0, "static_transforms"),
+    "/map": ("nav_msgs/msg/OccupancyGrid", 0, "map"),
+    IMAGES: ("sensor_msgs/msg/Image", 10, "image"),
+    "/scan": ("sensor_msgs/msg/LaserScan", 10, "scan"),
+    "/imu": ("sensor_msgs/msg/Imu", 100, "imu"),
+    "/odom": ("nav_msgs/msg/Odometry", 20, "odometry"),
+    "/tf": ("tf2_msgs/msg/TFMessage", 20, "transforms"),
 }
 
 
@@ -96,7 +96,7 @@ class Drive:
 
     def channel(self, topic: str) -> Channel:
         """Return a topic's channel, with definition and hash."""
-        type_name, rate = TYPES[topic]
+        type_name, rate, _ = TYPES[topic]
         definition, md5 = self.store.generate_msgdef(type_name, ros_version=self.ros)
         common: dict[str, Any] = {"definition": definition, "definition_format": "msg", "latched": rate == 0}
         if self.ros == 1:
@@ -108,17 +108,8 @@ class Drive:
 
     def raw(self, topic: str, at_ns: int) -> bytes:
         """Return the message of a topic at a moment, in wire form."""
-        type_name = TYPES[topic][0]
-        make = {
-            "/tf_static": self.static_transforms,
-            "/map": self.map,
-            IMAGES: self.image,
-            "/scan": self.scan,
-            "/imu": self.imu,
-            "/odom": self.odometry,
-            "/tf": self.transforms,
-        }[topic]
-        message = self.make(type_name, make(at_ns))
+        type_name, _, method = TYPES[topic]
+        message = self.make(type_name, getattr(self, method)(at_ns))
         if self.ros == 1:
             return bytes(self.store.serialize_ros1(message, type_name))
         return bytes(self.store.serialize_cdr(message, type_name, little_endian=True))
@@ -248,7 +239,7 @@ class Drive:
 def moments(seconds: float) -> Iterator[tuple[int, str]]:
     """Yield (nanoseconds from the start, topic) in time order."""
     events = []
-    for order, (topic, (_, rate)) in enumerate(TYPES.items()):
+    for order, (topic, (_, rate, _)) in enumerate(TYPES.items()):
         period_ns = 1_000_000_000 // rate if rate else 0
         count = math.ceil(seconds * rate) if rate else 1
         events += [(number * period_ns, order, topic) for number in range(count)]

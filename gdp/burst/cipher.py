@@ -30,7 +30,6 @@ from gdp.frame.codec import (
     PART_AT,
     PARTS_AT,
     Flag,
-    authenticated,
 )
 from gdp.sansio import ReceivedFrame
 
@@ -103,7 +102,8 @@ class MessageCipher:
         """Return plaintext, and ciphertext with tag, of a part whose tag ends at ``end``; None: it was altered."""
         payload = frame[BODY_AT:end]
         try:
-            return self._aead.decrypt(frame[NUMBER_AT:PACE_AT], payload, authenticated(frame)), payload
+            additional = frame[:HOPS_AT] + frame[HOPS_AT + 1 : HEADER_BYTES]
+            return self._aead.decrypt(frame[NUMBER_AT:PACE_AT], payload, additional), payload
         except InvalidTag:
             return None
 

@@ -312,11 +312,11 @@ class Delivery:
         """Queue the messages of a number, and count what lies before them as lost; a malformed one is dropped."""
         number, flags, body, parts, hops, head = reassembled
         sequence, messages, count = int.from_bytes(head[:SEQUENCE_BYTES], "big"), [body], 1
-        begin = head[SEQUENCE_BYTES:]
-        self.delivered_bytes += len(begin) + len(body)
-        if len(head) < SEQUENCE_BYTES or sequence > NUMBER_MAX:
+        begin, begin_bytes = head[SEQUENCE_BYTES:], len(head) - SEQUENCE_BYTES
+        if begin_bytes < 0 or sequence > NUMBER_MAX:
             self._data.drops[DropReason.MALFORMED] += 1
             return
+        self.delivered_bytes += begin_bytes + len(body)
         if flags & _BUNDLE:
             try:
                 begin, messages = b"", unpack(begin + body)

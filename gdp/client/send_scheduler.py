@@ -97,7 +97,8 @@ class SendScheduler:
         """Count what the only publisher sent: after its frames have left, so that they need not wait for that."""
         publisher, self.uncounted = self.uncounted, None
         if publisher is not None:
-            publisher.sent_frames.count()
+            if publisher.sent_frames.leaving is not None:
+                publisher.sent_frames.count()
             if self._is_idle:
                 publisher.governing_paths.note_idle()
 

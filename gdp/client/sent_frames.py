@@ -131,10 +131,11 @@ class SentFrames:
         samples = burst.samples(frames, 0, count) if self._counts_losses else ()  # striped ones would prove no order
         sizes: list[tuple[int, int]] = []
         for at in range(0, count, FLIGHT_FRAMES):
-            flight = frames[at : at + FLIGHT_FRAMES]
-            sizes.append((sum(map(len, flight)), len(flight)))
+            left = count - at
+            size = sum(map(len, frames[at : at + FLIGHT_FRAMES]))
+            sizes.append((size, left if left < FLIGHT_FRAMES else FLIGHT_FRAMES))
         self._count += count
-        self._note_places(frames, before + 1, is_repair=is_repair)
+        self._note_places(frames, count, before + 1, is_repair=is_repair)
         for name in names:
             if name not in self._readers:
                 self._readers[name] = _Reader(resolved=before)
@@ -159,10 +160,9 @@ class SentFrames:
                 yield frames[begin:end]
                 begin = end
 
-    def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
+    def _note_places(self, frames: Sequence[bytes], count: int, place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""
         number, part = last_number, last_part = NUMBER_AND_PART.unpack_from(frames[0], NUMBER_AT)
-        count = len(frames)
         if count > 1:
             last_number, last_part = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
         if not is_repair and number == last_number and last_part - part == count - 1:  # of one message, in order
@@ -233,7 +233,7 @@ class SentFrames:
             return False
         lost = (place - reader.unseen - acknack.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
-        new_lost = max(lost - reader.lost, 0)
+        new_lost = lost - reader.lost if lost > reader.lost else 0
         reader.lost += new_lost
         frames = sum(flight.frames for flight in confirmed) if self._paces else reader.resolved - before
         judged = reader.receipts.judge(acknack.receipts, place, frames, new_lost) if self._counts_losses else 0

@@ -271,7 +271,8 @@ class WriterProxy:
         if (self._copies is not None or self._data.repeats.copies) and self.delivery.is_reliable:
             missing = self._deferred.poll_due(missing, self._lag_s(), now_s)
         schedule.handle_reported(now_s, is_missing=bool(missing))
-        schedule.due_s = min(schedule.due_s, self._deferred.due_s, awaited_s)
+        for each_s in (self._deferred.due_s, awaited_s):
+            schedule.due_s = each_s if each_s < schedule.due_s else schedule.due_s
         expected = self.delivery.expected
         part, sequence = self._data.progress(expected) if self._data.unfinished_bytes else 0, self.delivery.sequence
         share = 0 if self._striped is None else self._striped.poll_share()
@@ -279,9 +280,10 @@ class WriterProxy:
         if self.pace < PACE_MAX:
             flags, share = AckNackFlag.PACED, self.pace
         newest, newest_part, came_s = schedule.newest
+        held_us = round((now_s - came_s) * 1e6)
         acknack = new_tuple(AckNack, (
             flags, expected, part, missing or late, sequence, self.losses.total, share,
-            schedule.received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
+            schedule.received, newest, newest_part if newest_part > 0 else 0, held_us if held_us > 0 else 0,
             (self._data.frames - self.recovery.recovered) & FRAMES_MASK, schedule.receipts & RECEIPTS_MASK,
         ))  # fmt: skip
         return self._over_paths(self._sealer.seal_all(acknack, now_s))

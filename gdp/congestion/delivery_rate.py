@@ -87,9 +87,10 @@ class DeliveryRate:
             at_s: when it would have come if the reader had not held it back.
         """
         self.delivered += size
-        self._delivered_s = max(self._delivered_s, at_s)
+        self._delivered_s = at_s if at_s > self._delivered_s else self._delivered_s
         self._first_sent_s = newest.sent_s
-        interval_s = max(newest.sent_s - newest.first_sent_s, self._delivered_s - newest.delivered_s)
+        sending_s, interval_s = newest.sent_s - newest.first_sent_s, self._delivered_s - newest.delivered_s
+        interval_s = sending_s if sending_s > interval_s else interval_s
         if interval_s <= 0 or interval_s < least_s:
             return None
         return (self.delivered - newest.delivered) / interval_s

@@ -28,7 +28,8 @@ class Pacer:
 
     def set_rate(self, bytes_s: float, rtt_s: float) -> None:
         """Set the rate, and the smoothed round trip; 0: none yet."""
-        self.bytes_s, self.credit_s = bytes_s, min(_CREDIT_SHARE * rtt_s, _CREDIT_MOST_S)
+        credit_s = _CREDIT_SHARE * rtt_s
+        self.bytes_s, self.credit_s = bytes_s, credit_s if credit_s < _CREDIT_MOST_S else _CREDIT_MOST_S
 
     def charge(self, size: int, now_s: float) -> None:
         """Delay what follows by the time that so many bytes take.

@@ -111,7 +111,8 @@ class PathModel:
 
     def add_hold(self, hold_s: float, now_s: float) -> None:
         """Add how long the oldest frame of a report had waited for it."""
-        self.hold_s = self._hold.add(now_s, min(hold_s, _HOLD_MOST_S), now_s - _HOLD_WINDOW_S)
+        hold_s = hold_s if hold_s < _HOLD_MOST_S else _HOLD_MOST_S
+        self.hold_s = self._hold.add(now_s, hold_s, now_s - _HOLD_WINDOW_S)
 
     def add_rate(self, rate: float, at_round: int, now_s: float, *, is_full: bool) -> None:
         """Add a delivery rate; ``is_full``: the window was used, and more waited."""

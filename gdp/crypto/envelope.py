@@ -172,7 +172,12 @@ class Sealer:
         """
         if number <= self._last_number:
             raise LocalError(f"message number {number} was sealed before")
-        size = len(prefix) + (len(message) if isinstance(message, bytes) else message.message_bytes)
+        origin: Sealed | None = None
+        # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
+        if isinstance(message, bytes):
+            size = len(prefix) + len(message)
+        else:
+            size, origin, message = len(prefix) + message.message_bytes, message._origin or message, b""
         if self._capacity[0] != mtu:
             self._capacity = mtu, fragment_capacity(mtu)
         capacity = self._capacity[1]
@@ -188,10 +193,12 @@ class Sealer:
         salt = self._random_bytes(SALT_BYTES)
         head = template[:NUMBER_AT] + _NUMBERS.pack(number, 0, parts) + template[INCARNATION_AT:] + salt
         cipher, signer = burst.CIPHER(self._keys.of(salt)), self._signer
-        return Sealed(
+        sealed = Sealed(
             cipher=cipher, signer=signer, head=head, parts=parts, prefix=prefix, message=message, size=size,
             capacity=capacity,
         )  # fmt: skip
+        sealed._origin = origin
+        return sealed
 
 
 class Sealed(Sequence[bytes]):
@@ -205,7 +212,7 @@ class Sealed(Sequence[bytes]):
         head: bytes,
         parts: int,
         prefix: bytes,
-        message: bytes | Sealed,
+        message: bytes,
         size: int,
         capacity: int,
     ) -> None:
@@ -213,13 +220,8 @@ class Sealed(Sequence[bytes]):
         self._signer = signer
         self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
         self._head, self.parts, self._prefix = head, parts, prefix
-        self._origin: Sealed | None = None
-        # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
-        if isinstance(message, bytes):
-            self._message = message
-        else:
-            self._message = b""
-            self._origin = message._origin or message
+        self._message = message
+        self._origin: Sealed | None = None  # opened when the first frame is requested
         self._capacity = capacity
         self._running = None if signer is None else digest_of(head)
         self._frames: list[bytes] = []

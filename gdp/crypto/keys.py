@@ -23,6 +23,7 @@ KEY_BYTES: Final = 33
 SIGNATURE_BYTES: Final = 64
 WRONG_PASSPHRASE: Final = "does not open: a wrong passphrase, or the file was altered"
 _HALF: Final = SIGNATURE_BYTES // 2
+_HALF_BITS: Final = 8 * _HALF
 _ECDSA: Final = ec.ECDSA(hashes.SHA256())
 _ECDSA_DIGEST: Final = ec.ECDSA(Prehashed(hashes.SHA256()))
 
@@ -215,9 +216,10 @@ def _load(pem: bytes, passphrase: bytes | None) -> object:
 def _to_der(signature: bytes) -> bytes:
     if len(signature) != SIGNATURE_BYTES:
         raise StatementError(DropReason.BAD_SIGNATURE, f"{len(signature)} bytes, not {SIGNATURE_BYTES}")
-    return encode_dss_signature(int.from_bytes(signature[:_HALF], "big"), int.from_bytes(signature[_HALF:], "big"))
+    both = int.from_bytes(signature, "big")
+    return encode_dss_signature(both >> _HALF_BITS, both & (1 << _HALF_BITS) - 1)
 
 
 def _from_der(signature: bytes) -> bytes:
     r, s = decode_dss_signature(signature)
-    return r.to_bytes(_HALF, "big") + s.to_bytes(_HALF, "big")
+    return (r << _HALF_BITS | s).to_bytes(SIGNATURE_BYTES, "big")

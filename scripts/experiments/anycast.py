@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from experiment import Finding, Report, command_line, run_experiment
-from page_text import text_of
 from pictures import Span, save_timeline
 from samples import Sample, p99
 from skeleton import Options
@@ -93,9 +92,8 @@ def measure(options: Options) -> Report:
     shown = [each for each in _samples(sites, begun_s) if each.begun_s < 3 * _PHASE_S * _SHOWN]
     spans = [Span(each.machine, each.from_s - begun_s, each.to_s - begun_s) for each in roaming.spans[:_SHOWN]]
     moves = [each - begun_s for each in roaming.moved[:_SHOWN]]
-    return Report(
+    return Report.of(
         "anycast",
-        "Anycast: the nearest of three replicas",
         {"all requests": _samples(sites, begun_s)},
         [
             Finding(
@@ -106,9 +104,9 @@ def measure(options: Options) -> Report:
             Finding("executions of a request, mean", copies),
             Finding("frames on the uplink for a request of one frame", frames / len(sites.requests), 1.1, True),
         ],
-        text_of("anycast", hz=_HZ, size=SIZE, turns=turns),
         {"turns": turns, "requests": len(sites.requests), "clock": "virtual"},
         lambda path, title: save_timeline(path, title, shown, spans, 0.0, moves),
+        {"hz": _HZ, "size": SIZE, "turns": turns},
     )
 
 

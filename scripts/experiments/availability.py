@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from experiment import Computed, command_line, run_experiment
+from experiment import Report, Rows, command_line, run_experiment
 from machine import data_folder
-from page_text import text_of
-from report import markdown_table, print_table
 from skeleton import Options
 from spot_trace import Share, Trace, none_up, outages, pool_down, replica_down, share_with_interval
 
@@ -61,18 +59,17 @@ def main(words: Sequence[str] | None = None) -> None:
     run_experiment(parser, measure, words)
 
 
-def measure(options: Options) -> Computed:
+def measure(options: Options) -> Report:
     """Replay every pool with every recovery time; ``--quick``: with the first one."""
     traces, chance = recorded(), np.random.default_rng(options.seed)
     spans = [seconds_from_text(text) for text in options.recovery or RECOVERIES[: 1 if options.quick else None]]
     cases = [case for recovery_s in spans for case in replay(traces, recovery_s, chance)]
-    return Computed(
+    return Report(
         "availability",
-        "Availability, by replaying preemptions",
         {"source": measured().source, "seed": options.seed, "cases": [asdict(case) for case in cases]},
-        page(cases),
-        lambda: print_table(_HEAD, map(_cells, cases), words=2),
+        {"table": Rows(_HEAD, [_cells(case) for case in cases], words=2, numbers=5)},
         lambda path, _: _draw(path, cases),
+        _figures(),
     )
 
 
@@ -99,23 +96,19 @@ def replay(traces: Sequence[Trace], recovery_s: float, chance: np.random.Generat
         yield Case("moves", "".join(trace.zone for trace in traces), count, recovery_s, share, None)
 
 
-def page(cases: Sequence[Case]) -> str:
-    """Return the page, in Markdown."""
+def _figures() -> dict[str, object]:
     seen = measured()
     low, high = seen.factors
-    text = text_of(
-        "availability",
-        source=seen.source,
-        taken=", ".join(f"{zone} {share:.0%}" for zone, share in seen.taken_share.items()),
-        uptime=duration_text(round(seen.uptime_s)),
-        ways="\n".join(f"- *{way}*: {what}." for way, what in WAYS.items()),
-        table=markdown_table(_HEAD, map(_cells, cases), numbers=5),
-        block=duration_text(BLOCK_S),
-        resamples=RESAMPLES,
-        low=low,
-        high=high,
-    )
-    return f"{text}\n"
+    return {
+        "source": seen.source,
+        "taken": ", ".join(f"{zone} {share:.0%}" for zone, share in seen.taken_share.items()),
+        "uptime": duration_text(round(seen.uptime_s)),
+        "ways": "\n".join(f"- *{way}*: {what}." for way, what in WAYS.items()),
+        "block": duration_text(BLOCK_S),
+        "resamples": RESAMPLES,
+        "low": low,
+        "high": high,
+    }
 
 
 def _cells(case: Case) -> tuple[str, ...]:

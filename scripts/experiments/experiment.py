@@ -1,7 +1,7 @@
 """Common parts of the experiments: command line, field, table, page, picture, and a file with every latency.
 
 I/O. Prints, and writes ``NAME.json``, ``NAME.md`` and ``NAME.png`` into the folder of the command line. An experiment
-states its options and measures; one whose samples are no latencies returns a ``Computed``::
+states its options and measures::
 
     def measure(options: Options) -> Report: ...
 
@@ -15,13 +15,14 @@ import argparse
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
 from field import REPLICA, Field, Served, Work
 from machine import MachineState, machine_state, require_trust, require_writable
+from page_text import text_of
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from skeleton import Options, add_allow_load, clean_exit
@@ -31,9 +32,10 @@ from lab.process import new_run
 
 OUTPUT: Final = ROOT / "docs" / "experiments"
 CASES: Final = ("one server", "two replicas")
-_COLUMNS: Final = ("requests", "failed", "mean, ms", "p50, ms", "p99, ms", "worst, ms")
+_COLUMNS: Final = ("", "requests", "failed", "mean, ms", "p50, ms", "p99, ms", "worst, ms")
 Panels = dict[str, dict[str, list[float]]]  # by panel and case
 _FIGURES: Final = ("figure", "here", "target", "", "paper")
+_LIST: Final = "\n\n- "  # begins the first list of a text
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +59,31 @@ class Finding:
             return ""
         return "met" if (self.measured <= self.target if self.at_most else self.measured >= self.target) else "MISSED"
 
-    def cells(self, state: MachineState) -> tuple[str, ...]:
-        """Return its row of a table; the machine's load marks it where it is high."""
+    def cells(self) -> tuple[str, ...]:
+        """Return its row of a table."""
         target = "" if self.target is None else f"{'≤' if self.at_most else '≥'} {number_text(self.target)}"
-        return self.what + state.mark, number_text(self.measured), target, self.outcome, self.paper
+        return self.what, number_text(self.measured), target, self.outcome, self.paper
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Table of a page, which is also printed.
+
+    ``title``: in print. ``words``: first columns, of words, in print. ``numbers``: last columns, of figures, in a page.
+    ``is_marked``: a busy machine marks each row with its load.
+    """
+
+    head: Sequence[str]
+    cells: Sequence[Sequence[str]]
+    title: str = ""
+    words: int = 1
+    numbers: int = 0
+    is_marked: bool = False
+
+    def under(self, state: MachineState) -> list[Sequence[str]]:
+        """Return the rows as measured on a machine."""
+        mark = state.mark if self.is_marked else ""
+        return [(first + mark, *more) for first, *more in self.cells]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,89 +91,77 @@ class Report:
     """Outcome of an experiment.
 
     Args:
-        name: of its files, such as ``fig5``.
-        groups: samples by their label in the table.
-        text: the method, and after it as a list the differences from the paper.
+        name: of its files, such as ``fig5``, and of the text of its page, whose first line is the title.
+        document: what the JSON has, without the machine.
+        tables: by their names in the text; without any, the text itself is printed.
         draw: writes the picture to a path, under a title.
+        figures: further ones in the text.
+        settings: stated at the end of the page; a report with settings also prints the notes, the text's list.
     """
 
     name: str
-    title: str
-    groups: Mapping[str, Sequence[Sample]]
-    findings: Sequence[Finding]
-    text: str
-    settings: Mapping[str, str | int | float]
-    draw: Callable[[Path, str], None]
-
-    def rows(self, state: MachineState) -> list[tuple[str, ...]]:
-        """Return the table's rows, name first; the machine's load marks each where it is high."""
-        rows = []
-        for name, samples in self.groups.items():
-            found = Summary.of(samples)
-            times = [number_text(1e3 * each) for each in (found.mean_s, found.p50_s, found.p99_s, found.worst_s)]
-            rows.append((name + state.mark, str(found.count), str(found.failed), *times))
-        return rows
-
-    def to_dict(self, state: MachineState) -> dict[str, object]:
-        """Return the whole report, every latency included."""
-        return {
-            "experiment": self.name,
-            "machine": asdict(state),
-            "settings": dict(self.settings),
-            "groups": {name: [_short(each) for each in samples] for name, samples in self.groups.items()},
-            "findings": [{**asdict(each), "outcome": each.outcome} for each in self.findings],
-        }
-
-    def to_page(self, state: MachineState) -> str:
-        """Return the page in Markdown."""
-        command = f"```bash\nsudo .venv/bin/python scripts/experiments/{self.name}.py\n```"
-        method, notes = self._parts()
-        parts = [f"# {self.title}", method, command, f"![{self.title}]({self.name}.png)"]
-        parts += [markdown_table(("", *_COLUMNS), self.rows(state))]
-        parts += [markdown_table(_FIGURES, [each.cells(state) for each in self.findings])]
-        stated = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
-        return "\n\n".join([*parts, notes, f"Measured on {state}. Settings: {stated}."]) + "\n"
-
-    def show(self, state: MachineState) -> None:
-        """Print the tables and the notes."""
-        print(f"{self.title}\n{state}")
-        print_table(("", *_COLUMNS), self.rows(state), title="latency at the robot's node")
-        print_table(_FIGURES, [each.cells(state) for each in self.findings], title="figures")
-        print(self._parts()[1])
-
-    def _parts(self) -> tuple[str, str]:
-        """Return the method and the list of differences."""
-        method, _, notes = self.text.partition("\n\n- ")
-        return method, f"- {notes}"
-
-
-@dataclass(frozen=True, slots=True)
-class Computed:
-    """Outcome of an experiment that writes a document and a page of its own kind.
-
-    ``name``: of its files, such as ``table1``. ``print_tables``: without a machine, which the page names in its last
-    line. ``draw``: as in ``Report``.
-    """
-
-    name: str
-    title: str
     document: Mapping[str, object]
-    page: str
-    print_tables: Callable[[], None]
+    tables: Mapping[str, Rows]
     draw: Callable[[Path, str], None]
+    figures: Mapping[str, object]
+    settings: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        groups: Mapping[str, Sequence[Sample]],
+        findings: Sequence[Finding],
+        settings: Mapping[str, str | int | float],
+        draw: Callable[[Path, str], None],
+        figures: Mapping[str, object] | None = None,
+    ) -> Report:
+        """Return the report on latencies; ``groups``: samples by their label in the table."""
+        rows = [
+            (label, str(found.count), str(found.failed), *(number_text(1e3 * each) for each in found.times_s))
+            for label, found in ((label, Summary.of(samples)) for label, samples in groups.items())
+        ]
+        document = {
+            "settings": dict(settings),
+            "groups": {label: [_short(each) for each in samples] for label, samples in groups.items()},
+            "findings": [{**asdict(each), "outcome": each.outcome} for each in findings],
+        }
+        tables = {
+            "latencies": Rows(_COLUMNS, rows, "latency at the robot's node", is_marked=True),
+            "findings": Rows(_FIGURES, [each.cells() for each in findings], "figures", is_marked=True),
+        }
+        return cls(name, document, tables, draw, figures or {}, settings)
 
     def to_dict(self, state: MachineState) -> dict[str, object]:
         """Return the document, with the machine."""
         return {"experiment": self.name, "machine": asdict(state), **self.document}
 
+    def to_text(self, state: MachineState) -> str:
+        """Return the page in Markdown, without its last line."""
+        tables = {
+            name: markdown_table(each.head, each.under(state), each.numbers) for name, each in self.tables.items()
+        }
+        return text_of(self.name, **tables, **self.figures)
+
     def to_page(self, state: MachineState) -> str:
         """Return the page in Markdown."""
-        return f"{self.page}\nWritten on {state}.\n"
+        stated = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
+        last = f"Measured on {state}. Settings: {stated}." if stated else f"Written on {state}."
+        return f"{self.to_text(state)}\n\n{last}\n"
 
     def show(self, state: MachineState) -> None:
-        """Print the tables."""
-        print(f"{self.title}\n{state}")
-        self.print_tables()
+        """Print the title, the tables and the notes."""
+        text = self.to_text(state)
+        print(f"{title_of(text)}\n{state}")
+        for each in self.tables.values():
+            print_table(each.head, each.under(state), title=each.title, words=each.words)
+        if self.settings or not self.tables:
+            print(f"- {text.partition(_LIST)[2]}" if self.settings else text)
+
+
+def title_of(text: str) -> str:
+    """Return the title of a page."""
+    return text.partition("\n")[0].removeprefix("# ")
 
 
 @contextmanager
@@ -209,7 +220,7 @@ def command_line(description: str | None) -> argparse.ArgumentParser:
 
 def run_experiment(
     parser: argparse.ArgumentParser,
-    measure: Callable[[Options], Report | Computed],
+    measure: Callable[[Options], Report],
     words: Sequence[str] | None = None,
     *,
     is_timed: bool = True,
@@ -233,7 +244,7 @@ def run_experiment(
     else:
         report.show(state)
     if folder is not None:
-        report.draw(folder / f"{report.name}.png", report.title)
+        report.draw(folder / f"{report.name}.png", title_of(report.to_text(state)))
         (folder / f"{report.name}.json").write_text(_text(document) + "\n", encoding="utf-8")
         (folder / f"{report.name}.md").write_text(report.to_page(state), encoding="utf-8")
         progress(f"written: {folder / report.name}.json, .md and .png")

@@ -12,7 +12,6 @@ from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
-from page_text import text_of
 from plot import Bar, Panel, save_bars
 from samples import Sample, Series
 from skeleton import Options
@@ -39,12 +38,10 @@ def measure(options: Options) -> Report:
     for form in list(FORMS)[1:]:
         share = figures[form][0] / figures[DIRECT][0]
         findings.append(Finding(f"{form}: share of direct, from the robot", share, most, True, one))
-    return Report(
+    return Report.of(
         "fig4",
-        "Figure 4: bytes on the robot's uplink",
         {form: samples for form, (samples, _) in found.items()},
         findings,
-        text_of("fig4"),
         {"replicas": options.replicas, "requests": count},
         lambda path, title: save_bars(path, title, "", _panels(figures)),
     )

@@ -22,7 +22,6 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Field, Served, Work
 from machine import DATA, RefusedError, data_folder
-from page_text import text_of
 from pictures import save_distributions
 from recorded import FASTER, LIMIT_S, draw, load
 from samples import Sample, Series, least_of_two, p99
@@ -79,12 +78,10 @@ def measure(options: Options) -> Report:
                 groups |= _named(name, found)
                 findings += _waiting_findings(name, found, both)
     panels = latencies_of(groups, "{name}, {case}", [*(f"{each}, computed" for each in counts), *lists], 1.0)
-    return Report(
+    return Report.of(
         "fig5",
-        "Figure 5: motion planning, one server against two",
         groups,
         findings,
-        _text(counts, timeout),
         {
             "computed trials": ", ".join(f"{n} {count}" for n, count in counts.items()) or "none",
             "timeout, s": timeout,
@@ -92,6 +89,7 @@ def measure(options: Options) -> Report:
             "trials of each wait": waits,
         },
         lambda path, title: save_distributions(path, title, panels, "latency, s"),
+        _figures(counts, timeout),
     )
 
 
@@ -167,21 +165,15 @@ def _lists(count: int, problems: Collection[str]) -> dict[str, tuple[list[float]
     return lists | {f"{_LOG_NORMAL}, waits": (log_normal(), log_normal())}
 
 
-def _text(counts: Mapping[str, int], timeout_s: float) -> str:
+def _figures(counts: Mapping[str, int], timeout_s: float) -> dict[str, object]:
     counted = ", ".join(f"{count} of {name}" for name, count in counts.items())
     runs, gained = [], []
     for name, each in load().items():
         stopped = sum(run_s >= LIMIT_S for run_s in each.runs_s)
         runs.append(f"{len(each.runs_s)} of {each.planner} in {name}, of which {stopped} reached the timeout")
         gained.append("{}: mean {:.2f}, p99 {:.2f}".format(name, *each.gains()))
-    return text_of(
-        "fig5",
-        limit_s=LIMIT_S,
-        runs="; ".join(runs),
-        gains="; ".join(gained),
-        counted=counted or "none in this run",
-        timeout_s=timeout_s,
-    )
+    figures = {"runs": "; ".join(runs), "gains": "; ".join(gained), "counted": counted or "none in this run"}
+    return {**figures, "limit_s": LIMIT_S, "timeout_s": timeout_s}
 
 
 if __name__ == "__main__":

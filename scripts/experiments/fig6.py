@@ -16,8 +16,7 @@ from typing import Final
 from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
-from image_request import TYPE
-from page_text import text_of
+from frames import TYPE
 from pictures import save_distributions
 from recorded import draw, segmentation_runs
 from samples import Sample, Series, least_of_two, p99
@@ -81,14 +80,13 @@ def measure(options: Options) -> Report:
         findings += gains(f"{{}} gain, {what}", found[_ONE], found[_TWO], setting.paper)
     findings.append(Finding("p99 gain offline, least of any two recorded runs", _OFFLINE, paper="1.3"))
     panels = latencies_of(groups, "{name}, {case}", counts, 1e3)
-    return Report(
+    return Report.of(
         "fig6",
-        "Figure 6: segmentation, one replica contended",
         groups,
         findings,
-        text_of("fig6", on_s=ON_S, off_s=OFF_S, runs=len(_RUNS), p50_ms=_P50_MS, p99_ms=_P99_MS, offline=_OFFLINE),
         {"requests of each case": ", ".join(map(str, counts.values())), "switches": plane},
         lambda path, title: save_distributions(path, title, panels, "latency, ms"),
+        {"on_s": ON_S, "off_s": OFF_S, "runs": len(_RUNS), "p50_ms": _P50_MS, "p99_ms": _P99_MS, "offline": _OFFLINE},
     )
 
 

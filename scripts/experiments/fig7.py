@@ -12,8 +12,7 @@ from typing import Final
 from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
-from image_request import TYPE
-from page_text import text_of
+from frames import TYPE
 from pictures import save_distributions
 from samples import Sample, Series
 from skeleton import Options
@@ -54,21 +53,19 @@ def measure(options: Options) -> Report:
         found, plane = asking.by_service("requests"), here.data_plane
     groups, findings = _compared(found, has_target=not options.compute)
     panels = latencies_of(groups, "{case}, {name}", [link for link, _ in _LINKS.values()], 1e3)
-    return Report(
+    return Report.of(
         "fig7",
-        "Figure 7: object detection, one replica's link slow",
         groups,
         findings,
-        text_of(
-            "fig7",
-            delay_ms=1e3 * DELAY_S,
-            mean_ms=1e3 * DELAY_S / 2.2,
-            p99_ms=1e3 * DELAY_S / 2.9,
-            twice_ms=2e3 * DELAY_S,
-            takes_ms=1e3 * _TAKES_S,
-        ),
         {"requests of each case": count, "servers": "compute" if options.compute else "wait", "switches": plane},
         lambda path, title: save_distributions(path, title, panels, "latency, ms"),
+        {
+            "delay_ms": 1e3 * DELAY_S,
+            "mean_ms": 1e3 * DELAY_S / 2.2,
+            "p99_ms": 1e3 * DELAY_S / 2.9,
+            "twice_ms": 2e3 * DELAY_S,
+            "takes_ms": 1e3 * _TAKES_S,
+        },
     )
 
 

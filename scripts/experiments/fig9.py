@@ -14,7 +14,6 @@ from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
-from page_text import text_of
 from pictures import Span, save_timeline
 from report import progress
 from samples import Sample, Series, Summary
@@ -75,14 +74,13 @@ def measure(options: Options) -> Report:
     end_s = max(each.begun_s for each in samples) - from_s
     spans = [replace(each, to_s=min(each.to_s, end_s)) for each in fault_injector.spans]
     drawn = [replace(each, machine=labels.get(each.machine, each.machine)) for each in samples]
-    return Report(
+    return Report.of(
         "fig9",
-        "Figure 9: a tag's pose while machines are killed and the supervisor replaces them",
         _groups(samples, spans, from_s),
         _findings(samples, asking, spans),
-        text_of("fig9", steady_s=_STEADY_S),
         {"machines": options.machines, "requests a second": _HZ, "kills": len(spans)},
         lambda path, title: save_timeline(path, title, drawn, spans, from_s),
+        {"steady_s": _STEADY_S},
     )
 
 

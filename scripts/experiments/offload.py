@@ -19,13 +19,12 @@ import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Final
 
 from bench_path import ROOT
-from experiment import OUTPUT, Computed, command_line, run_experiment
+from experiment import OUTPUT, Report, command_line, run_experiment
 from machine import machine_state
-from offload_page import CDR, CYCLONE, FAST, JSON, page_of, panels_of
+from offload_page import CDR, CYCLONE, FAST, JSON, figures_of, panels_of
 from plot import save_bars
 from report import progress
 from ros_row import DIRECT_DOMAIN, READY_S, Row
@@ -70,7 +69,7 @@ class Measured:
     failed: int = 0
 
 
-def measure(options: Options) -> Computed:
+def measure(options: Options) -> Report:
     """Compute three tasks on the robot, and on a server at the other end of the ring."""
     from offload_tasks import TASKS
 
@@ -89,12 +88,14 @@ def measure(options: Options) -> Computed:
             "alone": _alone(name, quick=quick) | machine,
         }
     document = {"slower": SLOWER, "tasks": tasks}
-    page = page_of(document)
-
-    def draw(path: Path, title: str) -> None:
-        save_bars(path, title, "", panels_of(document))
-
-    return Computed("offload", "FogROS G: Table I and Figure 5", document, page, lambda: print(page), draw)
+    panels = panels_of(document)
+    return Report(
+        "offload",
+        document,
+        {},
+        lambda path, title: save_bars(path, title, "", panels),
+        figures_of(document),
+    )
 
 
 def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[str, object]:

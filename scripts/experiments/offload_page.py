@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from machine import MachineState
-from page_text import text_of
+from page_text import PAPERS
 from plot import Bar, Panel
 from report import markdown_table, percentile
 
@@ -19,12 +19,7 @@ CDR: Final = "overlay, CDR"
 _CELLS: Final = ("network", "total")
 _SHOWN: Final = (CYCLONE, JSON, CDR)  # in Table I
 PAPER_ADDED_S: Final = 0.014
-# What the tasks compute here, and how far that is from what the paper computed.
-COMPUTES: Final = {
-    "vSLAM": "RGB-D visual odometry with ORB features; stand-in for ORB-SLAM2: no map, no loop closure",
-    "motion planning": "OMPL's RRTConnect with FCL in Home, one thread; the paper: MPT, a parallel planner",
-    "grasp planning": "antipodal sampling on the depth image; stand-in for Dex-Net: no neural network ranks",
-}
+COMPUTES: Final[Mapping[str, str]] = PAPERS["computes"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +33,7 @@ class PaperRow:
     total_s: float
 
 
-PAPER: Final = {
-    "vSLAM": PaperRow(0.68, 0.010, 1.4, 0.024, 1.4),
-    "motion planning": PaperRow(161.8, 0.008, 4.3, 0.023, 4.3),
-    "grasp planning": PaperRow(14.0, 0.065, 0.6, 0.089, 0.6),
-}
+PAPER: Final = {name: PaperRow(**row) for name, row in PAPERS["offload"].items()}
 
 Document = Mapping[str, Any]  # JSON
 
@@ -57,28 +48,26 @@ def added_s(network: Document, overlay: str, other: str) -> tuple[float, float, 
     return statistics.median(gaps), min(gaps), max(gaps)
 
 
-def page_of(document: Document) -> str:
-    """Return the page, in Markdown, of the measured tasks."""
+def figures_of(document: Document) -> dict[str, object]:
+    """Return the figures and tables in the page's text, of the measured tasks."""
     tasks: Document = document["tasks"]
     networks = {name: task["network"] for name, task in tasks.items()}
-    text = text_of(
-        "offload",
-        table1=markdown_table(
+    return {
+        "table1": markdown_table(
             ("scenario", "", "robot only", *(f"{who} {what}" for who in ("ROS 2", JSON, CDR) for what in _CELLS)),
             [row for name in PAPER if name in tasks for row in _rows(name, tasks[name])],
         ),
-        figure5=_figure5(networks),
-        details=_details(networks),
-        trials="; ".join(_trials(name, each) for name, each in networks.items()),
-        computes="\n- ".join(f"{name}: {COMPUTES[name]}." for name in PAPER if name in tasks),
-        ratios=", ".join(f"{name} {each:.2f}" for name, each in document["slower"].items()),
-        machines="\n- ".join(
+        "figure5": _figure5(networks),
+        "details": _details(networks),
+        "trials": "; ".join(_trials(name, each) for name, each in networks.items()),
+        "computes": "\n- ".join(f"{name}: {COMPUTES[name]}." for name in PAPER if name in tasks),
+        "ratios": ", ".join(f"{name} {each:.2f}" for name, each in document["slower"].items()),
+        "machines": "\n- ".join(
             f"{name}, {part}: measured on {MachineState(**each['machine'])}."
             for name, task in tasks.items()
             for part, each in task.items()
         ),
-    )
-    return f"{text}\n"
+    }
 
 
 def panels_of(document: Document) -> list[Panel]:

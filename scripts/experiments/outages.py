@@ -13,13 +13,11 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, field_of, run_experiment, work_of
 from field import Field, Served
-from page_text import text_of
 from pictures import Span, save_timeline
 from samples import Sample, Series
 from skeleton import Options
@@ -42,48 +40,30 @@ _SEED: Final = 15
 _STEP_S: Final = 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class Outage:
-    """Interval in which a machine is down, in seconds from the beginning."""
-
-    from_s: float
-    to_s: float
-
-
 class _Stopper:
-    """Stops and continues machines on schedule; driven by the samples as they arrive."""
+    """Stops and continues machines on schedule; driven by the samples as they arrive. ``spans``: the outages so far."""
 
-    def __init__(self, place: Field, drawn: Mapping[str, Sequence[Outage]]) -> None:
+    def __init__(self, place: Field, drawn: Sequence[Span]) -> None:
         self._servers = place.servers
         self._drawn = drawn
-        self._is_down = dict.fromkeys(drawn, False)
-        self.spans: list[Span] = []
         self._down_from_s: dict[str, float] = {}
+        self.spans: list[Span] = []
 
-    def see(self, since_s: float) -> None:
-        """Apply what is due ``since_s`` seconds after the beginning."""
-        for label, outages in self._drawn.items():
-            wanted = any(each.from_s <= since_s < each.to_s for each in outages)
-            if wanted and not self._is_down[label]:
-                self._servers[label].freeze()
-                self._down_from_s[label] = since_s
-            elif self._is_down[label] and not wanted:
-                self._servers[label].thaw()
-                self.spans.append(Span(label, self._down_from_s[label], since_s))
-            self._is_down[label] = wanted
-
-    def end(self, since_s: float) -> None:
-        """Continue every machine."""
-        for label, is_down in self._is_down.items():
-            if is_down:
-                self._servers[label].thaw()
-                self.spans.append(Span(label, self._down_from_s[label], since_s))
+    def see(self, since_s: float, *, is_over: bool = False) -> None:
+        """Apply what is due ``since_s`` seconds after the beginning; when it is over, every machine goes on."""
+        due = {each.machine for each in self._drawn if each.from_s <= since_s < each.to_s and not is_over}
+        for label in due - self._down_from_s.keys():
+            self._servers[label].freeze()
+            self._down_from_s[label] = since_s
+        for label in self._down_from_s.keys() - due:
+            self._servers[label].thaw()
+            self.spans.append(Span(label, self._down_from_s.pop(label), since_s))
 
 
 def measure(options: Options) -> Report:
     """Call a service on one machine and one on two, while machines stop and continue."""
     seconds = QUICK_S if options.quick else options.seconds
-    drawn = {each: draw_outages(random.Random(f"{_SEED} {each}"), seconds) for each in _MACHINES}
+    drawn = [span for each in _MACHINES for span in draw_outages(random.Random(f"{_SEED} {each}"), seconds, each)]
     served = [Served(_TWO, _TYPE, _MACHINES), Served(_ONE, _TYPE, _MACHINES[:1])]
     work = work_of(served, "replay", {each: {"waits_s": {}} for each in _MACHINES})
     count = round(2 * _HZ * seconds)
@@ -96,35 +76,34 @@ def measure(options: Options) -> Report:
             begun_s = begun_s if samples else sample.begun_s
             samples.append(sample)
             stopper.see(time.monotonic() - begun_s)
-        stopper.end(time.monotonic() - begun_s)
+        stopper.see(time.monotonic() - begun_s, is_over=True)
         plane = here.data_plane
     groups = {what: [each for each in samples if each.service == name] for what, name in _CASES.items()}
-    measured = {label: [Outage(s.from_s, s.to_s) for s in stopper.spans if s.machine == label] for label in _MACHINES}
-    return Report(
+    measured = {label: [each for each in stopper.spans if each.machine == label] for label in _MACHINES}
+    return Report.of(
         "outages",
-        "Availability, measured: machines that stop and go on",
         groups,
         _findings(groups, measured, seconds),
-        text_of("outages", up_s=UP_S, down_s=DOWN_S, patience_s=_PATIENCE_S),
         {"seconds": seconds, "outages": sum(map(len, measured.values())), "switches": plane},
         lambda path, title: save_timeline(path, title, groups["two machines"], stopper.spans, begun_s),
+        {"up_s": UP_S, "down_s": DOWN_S, "patience_s": _PATIENCE_S},
     )
 
 
 _CASES: Final = {"one machine": _ONE, "two machines": _TWO}
 
 
-def draw_outages(chance: random.Random, seconds: float) -> list[Outage]:
+def draw_outages(chance: random.Random, seconds: float, machine: str = "") -> list[Span]:
     """Return the outages of a machine within ``seconds``; times up and down are exponential."""
     outages, now_s = [], 0.0
     while (now_s := now_s + chance.expovariate(1 / UP_S)) < seconds:
-        outage = Outage(now_s, now_s + chance.expovariate(1 / DOWN_S))
+        outage = Span(machine, now_s, now_s + chance.expovariate(1 / DOWN_S))
         outages.append(outage)
         now_s = outage.to_s
     return outages
 
 
-def share_unanswered(machines: Sequence[Sequence[Outage]], seconds: float, patience_s: float) -> float:
+def share_unanswered(machines: Sequence[Sequence[Span]], seconds: float, patience_s: float) -> float:
     """Return the share of moments from which all machines stay down for ``patience_s``."""
     moments = [at * _STEP_S for at in range(round(seconds / _STEP_S))]
     lost = sum(
@@ -135,7 +114,7 @@ def share_unanswered(machines: Sequence[Sequence[Outage]], seconds: float, patie
 
 
 def _findings(
-    groups: Mapping[str, Sequence[Sample]], down: Mapping[str, Sequence[Outage]], seconds: float
+    groups: Mapping[str, Sequence[Sample]], down: Mapping[str, Sequence[Span]], seconds: float
 ) -> list[Finding]:
     shares = [100 * sum(not each.is_right for each in samples) / len(samples) for samples in groups.values()]
     lists = [list(down.values())[:1], list(down.values())]

@@ -1,48 +1,67 @@
-"""Recording of planning runs, for servers that wait: solves OMPL problems and writes down how much work each run was.
+"""Recording of runs, for servers that wait: how much work each run of a planner was, or how long one of DBNet took.
 
-I/O: reads the problems, appends to one JSON file. A run's work is the number of states that the planner checked. That
-number does not depend on what else the machine does, so the recording can run in the background.
+I/O: reads the problems, appends to one JSON file; of DBNet, writes another. A run of a planner counts the states that
+it checked. That number does not depend on what else the machine does, so the recording can run in the background. A run
+of DBNet is its processor time: waiting for a core does not count, what other work costs in the caches does.
 
     nice .venv/bin/python scripts/experiments/record.py --problem Home --runs 60       # about 5 minutes of one core
+    .venv/bin/python scripts/experiments/record.py --segmentation --runs 600           # about 1 minute of one core
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
+import sys
+import time
 from typing import Final
 
-import bench_path  # noqa: F401 - finds ``machine``
-from machine import DATA
+from bench_path import ROOT
 from planning import PROBLEMS, Problem, be_quiet
-from recorded import MOST_CHECKS, RECORDING
+from recorded import MOST_CHECKS, RECORDING, SEGMENTATION
 
+_PLANNER: Final = "RRTConnect"
 _PATIENCE_S: Final = 100_000.0  # of the wall clock, which other work may slow: the limit is that of checks
 
 
 def main() -> None:
-    """Record planning runs."""
+    """Record runs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--problem", required=True, choices=list(PROBLEMS))
-    parser.add_argument("--planner", default="RRTConnect", help="class in ompl.geometric (default: %(default)s)")
-    parser.add_argument("--runs", type=int, default=20, help="how many to add (default: %(default)s)")
-    parser.add_argument("--meshes", type=Path, default=DATA / "planning", help="folder of the problems")
-    parser.add_argument("--out", type=Path, default=RECORDING, help="the file to add to")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--problem", choices=list(PROBLEMS), help="of OMPL.app; its runs are added")
+    what.add_argument("--segmentation", action="store_true", help="DBNet; its runs replace those that are there")
+    parser.add_argument("--runs", type=int, default=20, help="how many (default: %(default)s)")
     options = parser.parse_args()
-    problem, planner, out = options.problem, options.planner, options.out
+    if options.segmentation:
+        _record_segmentation(options.runs)
+    else:
+        _record_planning(options.problem, options.runs)
+
+
+def _record_planning(problem: str, runs: int) -> None:
     be_quiet()
-    solved = Problem.load(options.meshes, problem)
-    for _ in range(options.runs):
-        checks = min(solved.solve(planner, _PATIENCE_S, lambda: False, MOST_CHECKS).checks, MOST_CHECKS)
-        recording = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
-        kept = recording.setdefault(problem, {"planner": planner, "checks": []})
-        if kept["planner"] != planner:
-            parser.error(f"the runs of {problem} in {out} are of {kept['planner']}")
-        kept["checks"].append(checks)
+    solved = Problem.load(ROOT / "scripts" / "data" / "planning", problem)
+    for _ in range(runs):
+        checks = min(solved.solve(_PLANNER, _PATIENCE_S, lambda: False, MOST_CHECKS).checks, MOST_CHECKS)
+        recording = json.loads(RECORDING.read_text(encoding="utf-8"))
+        recording.setdefault(problem, {"planner": _PLANNER, "checks": []})["checks"].append(checks)
         lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(each)}" for name, each in recording.items())
-        out.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
+        RECORDING.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
         print(f"{problem}: {checks} checks" + (", not solved" if checks == MOST_CHECKS else ""), flush=True)
+
+
+def _record_segmentation(runs: int) -> None:
+    from vision import Networks, Scene
+
+    networks, seconds = Networks(), []
+    for number in range(-1, runs):  # the first run also allocates, and is left out
+        scene = Scene.draw(abs(number))
+        begun_s = time.process_time()
+        mask = networks.segment(scene.frame)
+        seconds.append(round(time.process_time() - begun_s, 5))
+        if not scene.is_covered(mask):
+            sys.exit(f"error: frame {number}: the mask does not cover its words; nothing is written")
+    SEGMENTATION.write_text(json.dumps(seconds[1:]) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 Sans-I/O, but for reading the recordings. ``record.py`` writes the number of states that each run checked, by problem,
 with the planner's name. The number is proportional to the time of the run on an idle machine. A run that had no path
 after ``MOST_CHECKS`` was stopped there, and counts as the paper's timeout. Of a run of DBNet there is the processor
-time (``record_segmentation.py``).
+time.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Reads the JSON files of a folder; otherwise sans-I/O.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, median
@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from machine import MachineState
 from offload_page import CDR, CYCLONE, JSON, PAPER, PAPER_ADDED_S, added_s, seconds_text, share_text
-from page_text import text_of
+from page_text import PAPERS, text_of
 from report import markdown_table
 from samples import p99
 
@@ -24,27 +24,7 @@ THIS_RUN: Final = "this run"
 _RESAMPLES: Final = 2_000
 _SEED: Final = 1
 _CASES: Final = ("one server", "two replicas")
-# Group of JSON, without the case -> what it is called, mean gain and p99 gain of the paper, conditions.
-_GAINS: Final[Mapping[str, Mapping[str, tuple[str, str, str, str]]]] = {
-    "fig5": {
-        "Home, waits / 20": ("MPT Home", "up to 1.22", "1.42 to 5.53", "waits of recorded runs, times / 20"),
-        "Cubicles, waits": ("MPT Cubicles", "1.22 (1.16)", "5.53", "waits of recorded runs, unscaled"),
-        "Twistycool, waits / 40": ("MPT TwistyCool", "up to 1.22", "1.42", "waits of recorded runs, times / 40"),
-        "Home, computed": ("MPT Home", "up to 1.22", "1.42 to 5.53", "computed; both replicas on one machine"),
-        "Cubicles, computed": ("MPT Cubicles", "1.22 (1.16)", "5.53", "computed; both replicas on one machine"),
-        "Twistycool, computed": ("MPT TwistyCool", "up to 1.22", "1.42", "computed; both replicas on one machine"),
-    },
-    "fig6": {
-        "servers wait, no contention": ("SAM, no fault", "", "1.3", "waits; no second client"),
-        "servers wait, contended": ("SAM, second client", "1.31", "1.96", "waits; second client on and off"),
-        "servers compute, no contention": ("SAM, no fault", "", "1.3", "computed; all on one machine"),
-        "servers compute, contended": ("SAM, second client", "1.31", "1.96", "computed; all on one machine"),
-    },
-    "fig7": {
-        "round trip +100 ms": ("YOLOv8, +100 ms", "2.1", "3.9", "round trip +100 ms"),
-        "each way +100 ms": ("YOLOv8, +100 ms", "2.1", "3.9", "each way +100 ms"),
-    },
-}
+_GAINS: Final = PAPERS["gains"]
 _NUMBERS: Final = {"fig5": "FT Figure 5", "fig6": "FT Figure 6", "fig7": "FT Figure 7"}
 
 

@@ -76,6 +76,11 @@ class Summary:
     p99_s: float
     worst_s: float
 
+    @property
+    def times_s(self) -> tuple[float, ...]:
+        """Return mean, median, 99th percentile and the worst."""
+        return self.mean_s, self.p50_s, self.p99_s, self.worst_s
+
     @classmethod
     def of(cls, samples: Sequence[Sample]) -> Summary:
         """Return the summary of one request or more; failed ones count with the time that they cost.

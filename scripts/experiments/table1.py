@@ -11,13 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Final
 
-from experiment import Computed, command_line, run_experiment
-from page_text import text_of
+from experiment import Report, Rows, command_line, run_experiment
+from page_text import PAPERS
 from plot import Bar, Panel, save_bars
-from report import markdown_table, print_table
 from skeleton import Options
 
 from fog.catalog.prices import aws_prices
@@ -30,15 +28,7 @@ _WAYS: Final = ("one on-demand", "two on-demand", "two spot")
 _HEAD: Final = ("application", "needs", "", *_WAYS, "two spot / one on-demand", "machines")
 _TYPE_HEAD: Final = (*_WAYS, "a month: one", "two", "two spot", "two spot cost", "taken a month")
 REGIONS: Final = ("us-west-1", "us-west-2")  # the paper's
-# Application -> what a machine must have, and the paper's USD an hour: one on-demand, two on-demand, two spot.
-APPLICATIONS: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
-    "YOLO": ("cpu:16", (0.40, 0.80, 0.34)),
-    "SAM": ("cpu:4,T4", (0.53, 1.06, 0.44)),
-    "MPT Home": ("cpu:32", (1.79, 3.58, 1.69)),
-    "MPT Cubicles": ("cpu:32", (1.79, 3.58, 1.69)),
-    "MPT TwistyCool": ("cpu:64", (3.58, 7.16, 1.68)),
-    "Pick-scan-place": ("cpu:16", (0.40, 0.80, 0.34)),
-}
+APPLICATIONS: Final = {name: (needs, tuple(usd)) for name, (needs, usd) in PAPERS["applications"].items()}
 
 # Ratio -> the prices of a row that it divides: 0: one on-demand, 1: two on-demand, 2: two spot.
 _RATIOS: Final = {"one on-demand / two spot": (0, 2), "two on-demand / two spot": (1, 2)}
@@ -82,29 +72,44 @@ def main(words: Sequence[str] | None = None) -> None:
     run_experiment(parser, measure, words)
 
 
-def measure(options: Options) -> Computed:
+def measure(options: Options) -> Report:
     """Look up the prices; ``--quick`` takes no less time."""
-    region: str = options.region
+    return report(options.region)
+
+
+def report(region: str) -> Report:
+    """Return the prices of the applications, and of the machine types of a region."""
     rows, needed = bills(region), applications()
-
-    def print_tables() -> None:
-        print_table(_HEAD, _application_rows(needed), words=3)
-        print_table(_RATIO_HEAD, _ratio_rows(needed))
-        print_table((f"{region}, USD", *_TYPE_HEAD), map(_cells, rows))
-
+    best, worst = (pick(rows, key=lambda row: row.times_cheaper) for pick in (max, min))
     document = {
         "region": region,
         "sources": aws_prices().sources,
         "applications": [asdict(each) for each in needed],
         "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
     }
-    title = "Table I: the price of a replica"
-
-    def draw(path: Path, title: str) -> None:
-        save_bars(path, title, f"AWS {region}", [_panel(rows)])
-
-    pictured = page(region, rows, needed)
-    return Computed("table1", title, document, pictured, print_tables, draw)
+    tables = {
+        "applications": Rows(_HEAD, _application_rows(needed), words=3),
+        "ratios": Rows(_RATIO_HEAD, _ratio_rows(needed)),
+        "types": Rows((region, *_TYPE_HEAD), [_cells(row) for row in rows], "USD"),
+    }
+    figures: dict[str, object] = {
+        "regions": " and ".join(REGIONS),
+        "least": best.bills[2].of_single,
+        "best": best.type_name,
+        "most": worst.bills[2].of_single,
+        "worst": worst.type_name,
+        "times": best.times_cheaper,
+        "sources": "; ".join(aws_prices().sources),
+    }
+    bars = [Bar(row.type_name, row.bills[2].of_single) for row in rows]
+    panel = Panel("two spot machines", "price, of one on-demand machine", bars)
+    return Report(
+        "table1",
+        document,
+        tables,
+        lambda path, title: save_bars(path, title, f"AWS {region}", [panel]),
+        figures,
+    )
 
 
 def bills(region: str) -> list[Row]:
@@ -178,31 +183,6 @@ def _cells(row: Row) -> tuple[str, ...]:
     hours = (f"{bill.usd_per_hour:.4f}" for bill in row.bills)
     months = (f"{bill.usd_per_month:,.2f}" for bill in row.bills)
     return (row.type_name, *hours, *months, f"{row.bills[2].of_single:.2f} ×", row.taken_a_month)
-
-
-def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str:
-    """Return the page, in Markdown."""
-    best = max(rows, key=lambda row: row.times_cheaper)
-    worst = min(rows, key=lambda row: row.times_cheaper)
-    text = text_of(
-        "table1",
-        regions=" and ".join(REGIONS),
-        applications=markdown_table(_HEAD, _application_rows(needed)),
-        ratios=markdown_table(_RATIO_HEAD, _ratio_rows(needed)),
-        types=markdown_table((region, *_TYPE_HEAD), map(_cells, rows)),
-        least=best.bills[2].of_single,
-        best=best.type_name,
-        most=worst.bills[2].of_single,
-        worst=worst.type_name,
-        times=best.times_cheaper,
-        sources="; ".join(aws_prices().sources),
-    )
-    return f"{text}\n"
-
-
-def _panel(rows: Sequence[Row]) -> Panel:
-    bars = [Bar(row.type_name, row.bills[2].of_single) for row in rows]
-    return Panel("two spot machines", "price, of one on-demand machine", bars)
 
 
 if __name__ == "__main__":

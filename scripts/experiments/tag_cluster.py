@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 import bench_path  # noqa: F401 - finds the packages of scripts
-from image_request import TYPE
+from frames import TYPE
 
 from fog.providers.local.machine_handle import find
 from fog.providers.local.netlinks import MACHINE_DEVICE, UP

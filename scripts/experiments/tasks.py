@@ -1,27 +1,22 @@
 """Tasks of a client: its requests, and the check of an answer; one class a kind of service.
 
-Sans-I/O. The frames are drawn once, when a task is made; only a task with frames loads the libraries that draw them.
+Sans-I/O. Only a task with frames loads the libraries that draw them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from functools import partial
+from typing import Final, TypeAlias
 
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import ListParameters, SetParameters
-
-if TYPE_CHECKING:
-    from vision import Grey, Scene
 
 Request: TypeAlias = "GetPlan.Request | ListParameters.Request | SetParameters.Request"
 Response: TypeAlias = "GetPlan.Response | ListParameters.Response | SetParameters.Response"
 
 WARM_UP: Final = -1  # the number of a request whose answer is not checked
-_FRAMES: Final = 24  # and then the first one again
-_APART_M: Final = 0.005
-_TURNED_RAD: Final = 0.03
 _NANO: Final = 1e-9
 _FILL: Final = "x" * 79  # 4 encapsulation, 4 count, 4 length, 80 text with its end, 8 depth: 100
 
@@ -78,85 +73,37 @@ class Number:
 
 
 class Look:
-    """Request for what a scene shows; ``is_right`` judges an answer. Note: the number of words."""
+    """Request for what a frame shows; ``name``: of ``frames.FRAME_TASKS``, which has the note, too."""
 
     kind = SetParameters
 
-    def __init__(self, is_right: Callable[[Mapping[str, Any], Scene], bool]) -> None:
-        from vision import Scene
+    def __init__(self, name: str, problem: str) -> None:
+        from frames import FRAME_TASKS
 
-        self._is_right = is_right
-        self._scenes = [Scene.draw(seed) for seed in range(_FRAMES)]
-
-    def request(self, number: int) -> Request:
-        """Return the request with this number."""
-        return _request(self._scenes[number % _FRAMES].frame, number)
-
-    def judge(self, number: int, response: Response) -> Judged:
-        """Return the value of an answer."""
-        said, scene = _said(response), self._scenes[number % _FRAMES]
-        return _judged(said, is_right=self._is_right(said, scene), note=len(scene.words))
-
-
-class Tag:
-    """Request for the pose of the tag; right is within 5 mm and 0.03 rad of the drawn one. Note: metres apart."""
-
-    kind = SetParameters
-
-    def __init__(self, problem: str) -> None:
         del problem
-        from tag import Pose, TagCamera
-
-        camera = TagCamera()
-        self._poses = [Pose.on_its_way(3 * number) for number in range(_FRAMES)]
-        self._frames = [camera.draw(pose) for pose in self._poses]
+        self._task = FRAME_TASKS[name]
+        self._drawn = self._task.draw()
 
     def request(self, number: int) -> Request:
         """Return the request with this number."""
-        return _request(self._frames[number % _FRAMES], number)
+        from frames import request_of
+
+        return request_of(self._drawn[number % len(self._drawn)][0], number)
 
     def judge(self, number: int, response: Response) -> Judged:
         """Return the value of an answer."""
-        from tag import Pose
+        from frames import said_in
 
-        said, truth = _said(response), self._poses[number % _FRAMES]
-        turn, at = said.get("turn"), said.get("at")
-        if not isinstance(turn, list) or not isinstance(at, list):
-            return _judged(said, is_right=False)
-        found = Pose(tuple(turn), tuple(at))
-        apart_m = found.apart_m(truth)
-        return _judged(said, is_right=apart_m <= _APART_M and found.turned_rad(truth) <= _TURNED_RAD, note=apart_m)
+        said = said_in(response)
+        return Judged(
+            said["machine"], said["worked_s"], *self._task.judge(said, self._drawn[number % len(self._drawn)][1])
+        )
 
 
-def _covers(said: Mapping[str, Any], scene: Scene) -> bool:
-    from image_request import mask_in
-
-    return scene.is_covered(mask_in(said["mask"]))
-
-
-def _request(frame: Grey, number: int) -> SetParameters.Request:
-    from image_request import request_of
-
-    return request_of(frame, number)
-
-
-def _said(response: Response) -> dict[str, Any]:
-    from image_request import said_in
-
-    return said_in(response)
-
-
-def _judged(said: Mapping[str, Any], *, is_right: bool, note: float = 0.0) -> Judged:
-    return Judged(said["machine"], said["worked_s"], is_right, note)
-
-
-Task: TypeAlias = "Plan | Number | Look | Tag"
+Task: TypeAlias = "Plan | Number | Look"
 
 TASKS: Final[Mapping[str, Callable[[str], Task]]] = {
     "plan": Plan,
     "number": Number,
-    "detect": lambda _: Look(lambda said, scene: scene.agrees(said["found"])),
-    "segment": lambda _: Look(_covers),
-    "count": lambda _: Look(lambda said, scene: said["words"] == len(scene.words)),
-    "tag": Tag,
+    **{name: partial(Look, name) for name in ("detect", "segment", "count", "tag")},
 }

@@ -18,9 +18,8 @@ from typing import Any, Final, NamedTuple
 
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
-from internet_demo.scenario import Display, Event, Outcome, Pace
-from internet_demo.stage import Stage
-from lab.dds import UDP_PROFILE
+from internet_demo.scenario import Display, Event, Outcome, Pace, Stage
+from lab.dds import udp_profile
 from lab.internet.access import Access
 from lab.internet.host import Host
 from lab.internet.laboratory import Laboratory
@@ -53,11 +52,12 @@ class _Stage(Stage):
             _Flow("/images", "camera", "/camera/image", self.drone, self.cloud),
             _Flow("/commands", "talker", "/chatter", self.cloud, self.drone),
         )
-        profiles = self._folder / "fast_dds.xml"
-        profiles.write_text(UDP_PROFILE.replace("<type>UDPv4</type>", _ON_LOOPBACK))
         self.graphs = {self.drone.label: Graph(2, _DOMAIN), self.cloud.label: Graph(1, 0)}
         for label, graph in self.graphs.items():
-            self._laboratory.hosts[label].environment = dict(graph.environment(self._folder / "ros-logs", profiles))
+            variables = graph.environment(self._folder)
+            self._laboratory.hosts[label].environment = dict(each.split("=", 1) for each in variables)
+        profile = udp_profile(self._folder)
+        profile.write_text(profile.read_text().replace("<type>UDPv4</type>", _ON_LOOPBACK))
 
     def admit(self, host: Host, token: str) -> None:
         """Let a machine join, and write its ROS into its proxy.yaml."""
@@ -108,7 +108,7 @@ def run_figure1(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome
         token = stage.create_domain()
         stage.start(stage.cloud_b)
         list(pool.map(stage.admit, (stage.drone, stage.cloud), (token, stage.make_token())))
-        _said(_launch(stage.cloud, "ring.nodes.master", str(MASTER_PORT)), "ready")
+        _said(_launch(stage.cloud, "ring.nodes", "1", "master", str(MASTER_PORT)), "ready")
         stage.start(stage.drone, stage.cloud)
         nodes = {flow.topic: _start(stage, pace, flow) for flow in stage.flows}
         stage.wait_until_joined()

@@ -1,6 +1,11 @@
-"""Scenario of the demonstration: machines join, traffic flows, and networks change under it.
+"""Scenario of the demonstration: machines join the domain of one of them, traffic flows, and networks change under it.
 
-I/O. Each step may be shown by a ``Display``.
+I/O. Each step may be shown by a ``Display``. ::
+
+    robot   wlan0 -- home, port-restricted NAT ----+
+            wwan0 -- 5G, symmetric NAT ------------+-- internet -- cloud-b, public: border, RIB, enrolment
+    cloud-a ------- provider, port-restricted NAT -+
+    edge    ------- office, IPv6 only -------------+
 """
 
 from __future__ import annotations
@@ -16,16 +21,43 @@ from rich.table import Table
 from rich.text import Text
 
 from gdp.trust.right import Right
-from internet_demo.stage import WIFI, WWAN, Stage
 from internet_demo.traffic import CAMERA, PLAN, Traffic
 from lab.command import StepDisplay
 from lab.internet.access import Access
 from lab.internet.host import Host
 from lab.internet.laboratory import Laboratory
-from lab.internet.overlay import Link
+from lab.internet.overlay import Link, Overlay
+from lab.internet.site import Site
 
+WIFI: Final = "wlan0"
+WWAN: Final = "wwan0"
 _PLAIN_EVERY_S: Final = 2.5
 _WAYS: Final = (("direct", True), ("border", False))
+
+
+class Stage(Overlay):
+    """Networks, and machines with their programs.
+
+    ``delay_ms``: of each uplink, in each direction; 0: none, and no process for it.
+    """
+
+    def __init__(self, laboratory: Laboratory, delay_ms: float) -> None:
+        self._laboratory, self._delay_ms = laboratory, delay_ms
+        self.cloud_b = laboratory.add_host("cloud-b", self.add_site("dc", Access.PUBLIC))
+        super().__init__(laboratory, self.cloud_b)
+        self._add_members()
+
+    def _add_members(self) -> None:
+        """Make the machines that join."""
+        self.home, self.mobile = self.add_site("home", Access.PORT_RESTRICTED), self.add_site("5g", Access.SYMMETRIC)
+        self.robot = self._laboratory.add_host("robot", self.home, WIFI)
+        self.robot.attach(self.mobile, WWAN)
+        self.cloud_a = self._laboratory.add_host("cloud-a", self.add_site("provider", Access.PORT_RESTRICTED))
+        self.edge = self._laboratory.add_host("edge", self.add_site("office", Access.IPV6_ONLY))
+
+    def add_site(self, label: str, access: Access) -> Site:
+        """Attach one more network."""
+        return self._laboratory.add_site(label, access, delay_ms=self._delay_ms)
 
 
 class Display(StepDisplay):

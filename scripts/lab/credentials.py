@@ -85,7 +85,7 @@ class OverlayCredentials:
         uplink: Mapping[str, object] | None = None,
     ) -> None:
         self.folder, self.owner = folder, folder / "owner"
-        self._topology, self._roamers, self._has_metrics = topology, roamers, metrics
+        self.topology, self._roamers, self._has_metrics = topology, roamers, metrics
         self._lease: Yaml = {"lease_s": lease_s}
         self._uplink = uplink or {}
         for domain in topology.domains:
@@ -118,7 +118,7 @@ class OverlayCredentials:
         """Make the keys of a node in the domain of a switch, unless it has some; return their folder."""
         identity = self.identity(role, label)
         if (role, label) not in self._names:
-            domain = self.domain(self._topology.domain_of(switch).label)
+            domain = self.domain(self.topology.domain_of(switch).label)
             self._names[role, label] = make_node(identity, role, f"{role.value}-{label}", domain).name
         return identity
 
@@ -128,8 +128,8 @@ class OverlayCredentials:
 
     def node_yaml(self, role: Role, label: str, switch: str | None = None) -> Yaml:
         """Return the two keys that every node's file begins with; ``switch``: one of its domain."""
-        own = self._topology.domain_of(switch or label).label
-        roots = {each.label: str(self.domain(each.label) / ROOT_CERTIFICATE) for each in self._topology.domains}
+        own = self.topology.domain_of(switch or label).label
+        roots = {each.label: str(self.domain(each.label) / ROOT_CERTIFICATE) for each in self.topology.domains}
         return {
             "identity": str(self.identity(role, label)),
             "domain": {"root": roots.pop(own), "trusts": list(roots.values())},
@@ -137,11 +137,11 @@ class OverlayCredentials:
 
     def ports(self, node: str) -> list[Yaml]:
         """Return the ports of a switch: one a link."""
-        return [{"iface": link.other(node), "cost": link.cost} for link in self._topology.links_of(node)]
+        return [{"iface": link.other(node), "cost": link.cost} for link in self.topology.links_of(node)]
 
     def switch(self, node: str, data_plane: str, **further: object) -> Path:
         """Write ``switch.yaml`` of a switch; return the file."""
-        attached = (at for at in self._topology.attachments if at.switch == node and at not in self._roamers)
+        attached = (at for at in self.topology.attachments if at.switch == node and at not in self._roamers)
         content = {
             **self.node_yaml(Role.SWITCH, node),
             "ports": [*self.ports(node), *({"iface": f"{at.ifname}-s", "optional": True} for at in self._roamers)],
@@ -153,8 +153,8 @@ class OverlayCredentials:
 
     def rib(self, at: Attachment, **further: object) -> Path:
         """Write ``rib.yaml`` of a RIB, below that of the tier above; return the file."""
-        upper = self._topology.domain_of(at.switch).upper
-        above = self._topology.rib_of(upper) if upper is not None else None
+        upper = self.topology.domain_of(at.switch).upper
+        above = self.topology.rib_of(upper) if upper is not None else None
         name = self.name(Role.RIB, above.switch).to_text() if above is not None else None
         content = {**self.node_yaml(Role.RIB, at.switch), "iface": at.ifname, "upper": name}
         return self._write("rib", at.switch, {**content, **self._lease, **self._uplink, **further})

@@ -24,25 +24,32 @@ _PROFILE: Final = """<?xml version="1.0" encoding="UTF-8" ?>
  </rtps></participant>
 </profiles></dds>
 """
-UDP_PROFILE: Final = _PROFILE.format(descriptors=_UDP, transports="<transport_id>udp</transport_id>")
+
+
+def udp_profile(folder: Path) -> Path:
+    """Return the file of the profile without shared memory, which ``ros_environment`` writes."""
+    return folder / "dds-udp.xml"
 
 
 def ros_environment(folder: Path, domain: int, *, shared_memory: bool = False) -> list[str]:
     """Return the environment of a ROS process, as ``KEY=value``.
 
-    The discovery range is ``SUBNET``, and the namespaces confine: ``LOCALHOST`` would change the transports.
+    The discovery range is ``SUBNET``, and the namespaces confine: ``LOCALHOST`` would change the transports. Shared
+    memory crosses the network namespaces of a machine.
 
     Args:
         folder: where the profile is written.
         shared_memory: whether processes of one machine use it; they use UDP otherwise.
     """
-    profile = folder / f"dds-{'shm' if shared_memory else 'udp'}.xml"
-    transports = "<transport_id>shm</transport_id><transport_id>udp</transport_id>"
-    text = _PROFILE.format(descriptors=_SHM + _UDP, transports=transports) if shared_memory else UDP_PROFILE
-    profile.write_text(text, encoding="utf-8")
+    profile = folder / "dds-shm.xml" if shared_memory else udp_profile(folder)
+    used = {"shm": _SHM, "udp": _UDP} if shared_memory else {"udp": _UDP}
+    transports = "".join(f"<transport_id>{each}</transport_id>" for each in used)
+    profile.write_text(_PROFILE.format(descriptors="".join(used.values()), transports=transports), encoding="utf-8")
     return [
         f"ROS_DOMAIN_ID={domain}",
         "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+        "ROS_LOCALHOST_ONLY=",
+        "ROS_STATIC_PEERS=",
         "RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
         f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
         f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",

@@ -128,12 +128,22 @@ class OverlayNodes(ClosedOnExit):
         process = self.running[role, node] = self.lab.start(node, role, argv)
         return process
 
-    def start_all(
-        self, role: Literal["switch", "rib"], nodes: Iterable[str], *words: str, ready_s: float = 60.0
+    def stand_up(
+        self, switches: Sequence[str], plane: str, *rib_words: str, ready_s: float = 60.0
     ) -> list[dict[str, Any]]:
-        """Start nodes; return what each says when it is ready. Raises ``FailedError``: one does not come up."""
-        started = [self.start(role, node, *words) for node in nodes]
-        return [each.read(ready_s) for each in started]
+        """Write the files of switches and of all RIBs, and start them; return what each switch says when it is ready.
+
+        ``plane``: as ``data_plane`` of ``switch.yaml``. Raises ``FailedError``: one does not come up.
+        """
+        for node in switches:
+            self.credentials.switch(node, plane)
+        said = [each.read(ready_s) for each in [self.start("switch", node) for node in switches]]
+        ribs = self.credentials.topology.attached("rib")
+        for at in ribs:
+            self.credentials.rib(at)
+        for each in [self.start("rib", at.switch, *rib_words) for at in ribs]:
+            each.read(ready_s)
+        return said
 
 
 class BenchNodes(OverlayNodes):
@@ -142,7 +152,7 @@ class BenchNodes(OverlayNodes):
     Args:
         switches: nodes with one, in the order in which they start. A member at one of them is attached to it; another
             member is joined to its switch by a link.
-        plane: as ``gdp-switch --data-plane``; any but ``auto`` must be the one that the switch takes.
+        plane: as in ``stand_up``; any but ``auto`` must be the one that the switch takes.
         label: of the folder with keys; one lab may have several in turn.
         overlay: the lab's topology without what is no part of the overlay; None: all of it is.
 
@@ -169,19 +179,10 @@ class BenchNodes(OverlayNodes):
         self.files.mkdir(mode=0o700)
         super().__init__(lab, OverlayCredentials(self._topology, self.files))
         self._switch_nodes = tuple(switches)
-        ribs = self._topology.attached("rib")
-        for node in switches:
-            self.credentials.switch(node, "auto")
-        for at in ribs:
-            self.credentials.rib(at)
         try:
-            words = [] if plane == "auto" else ["--data-plane", plane]
-            said = self.start_all("switch", switches, *words, ready_s=ready_s)
-            self.planes = {str(each.get("data_plane")) for each in said}
-            for taken in self.planes:
-                if plane != "auto" and not taken.startswith(plane):
-                    raise FailedError(f"the switch took the data plane {taken} instead of {plane}")
-            self.start_all("rib", [at.switch for at in ribs], ready_s=ready_s)
+            self.planes = {str(said.get("data_plane")) for said in self.stand_up(switches, plane, ready_s=ready_s)}
+            if others := [taken for taken in self.planes if plane != "auto" and not taken.startswith(plane)]:
+                raise FailedError(f"the switch took the data plane {', '.join(others)} instead of {plane}")
         except FailedError:
             self.close()
             raise

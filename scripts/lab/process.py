@@ -286,14 +286,13 @@ class LabProcess(ClosedOnExit):
 
         return until(found, lambda: f"{self.label} logs {pattern!r}, but: {self.logged}", patience_s)
 
-    def failed(self, how: str) -> FailedError:
-        """Return the error for this process's failure, with the last line of its log."""
-        return FailedError(f"{self.label} {how}: {''.join(self.last_lines(1))[-_REASON_CHARS:] or 'without a word'}")
-
-    def last_lines(self, count: int) -> Collection[str]:
-        """Return the last lines of its log that are not empty."""
+    def failed(self, how: str, lines: int = 1) -> FailedError:
+        """Return the error for this process's failure, with the last line of its log, or so many below each other."""
         with self.log.open(encoding="utf-8", errors="replace") as file:
-            return deque((line.rstrip() for line in file if line.strip()), maxlen=count)
+            last = deque((line.rstrip() for line in file if line.strip()), maxlen=lines)
+        if lines > 1:
+            return FailedError("\n    ".join([f"{self.label} {how}", *last]))
+        return FailedError(f"{self.label} {how}: {''.join(last)[-_REASON_CHARS:] or 'without a word'}")
 
 
 def end_processes(processes: Collection[LabProcess], patience_s: float = 3.0) -> None:

@@ -12,17 +12,12 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.ports.readiness import readable
-from lab.process import Event, FailedError, LabProcess
+from lab.process import Event, LabProcess
 
 READY_S: Final = 60.0
-_TAIL_LINES: Final = 12
+TAIL: Final = 12
 
 Note = Callable[[LabProcess, Event], object]
-
-
-def failed(process: LabProcess, how: str) -> FailedError:
-    """Return the error for a process's failure, with the last lines of its log."""
-    return FailedError("\n    ".join([f"{process.label} {how}", *process.last_lines(_TAIL_LINES)]))
 
 
 def exit_code(process: LabProcess, patience_s: float) -> int:
@@ -73,9 +68,9 @@ class Supervisor:
         """Return the newest event of this name of a process, when it has said one."""
         said = self._said.setdefault(process, {})
         if not self.follow(lambda: name in said or process.is_silent, patience_s):
-            raise failed(process, f"did not say {name!r} within {patience_s:g} s")
+            raise process.failed(f"did not say {name!r} within {patience_s:g} s", TAIL)
         if name not in said:
-            raise failed(process, f"ended with code {exit_code(process, patience_s)} before it said {name!r}")
+            raise process.failed(f"ended with code {exit_code(process, patience_s)} before it said {name!r}", TAIL)
         return said[name]
 
     def said(self, process: LabProcess, name: str) -> Event | None:
@@ -101,12 +96,12 @@ class Supervisor:
         """Return the seconds until a starting process is late; raises as the class says."""
         for process in self._required:
             if process.code is not None:
-                raise failed(process, f"ended with code {process.code}")
+                raise process.failed(f"ended with code {process.code}", TAIL)
         for process, (end_s, _) in self._starting.items():
             if process.is_silent:
-                raise failed(process, f"ended with code {exit_code(process, READY_S)} before it said 'ready'")
+                raise process.failed(f"ended with code {exit_code(process, READY_S)} before it said 'ready'", TAIL)
             if time.monotonic() >= end_s:
-                raise failed(process, f"did not say 'ready' within {READY_S:g} s")
+                raise process.failed(f"did not say 'ready' within {READY_S:g} s", TAIL)
         return min((end_s for end_s, _ in self._starting.values()), default=math.inf) - time.monotonic()
 
     def _take(self, process: LabProcess, event: Event) -> None:

@@ -155,26 +155,15 @@ def ring5(mtu: int = MTU_BYTES) -> Topology:
                   |                     backbone: nuc3 (upper RIB)                  |
                   +------------------------- cost 100 -----------------------------+
     """
+    first, *_, last = nodes = tuple(f"nuc{number}" for number in range(1, 6))
     return Topology(
-        links=(
-            Link("nuc1", "nuc2", mtu=mtu),
-            Link("nuc2", "nuc3", mtu=mtu),
-            Link("nuc3", "nuc4", mtu=mtu),
-            Link("nuc4", "nuc5", mtu=mtu),
-            Link("nuc5", "nuc1", cost=DETOUR_COST, mtu=mtu),
+        (*(Link(a, b, mtu=mtu) for a, b in pairwise(nodes)), Link(last, first, DETOUR_COST, mtu)),
+        (
+            DomainPlan("school", nodes[:2], upper="backbone"),
+            DomainPlan("backbone", nodes[2:3]),
+            DomainPlan("cloud", nodes[3:], upper="backbone"),
         ),
-        domains=(
-            DomainPlan("school", ("nuc1", "nuc2"), upper="backbone"),
-            DomainPlan("backbone", ("nuc3",)),
-            DomainPlan("cloud", ("nuc4", "nuc5"), upper="backbone"),
-        ),
-        attachments=(
-            Attachment("nuc2", "rib", "rib"),
-            Attachment("nuc3", "rib", "rib"),
-            Attachment("nuc4", "rib", "rib"),
-            Attachment("nuc1", "proxy", "robot"),
-            Attachment("nuc5", "proxy", "server"),
-        ),
+        _attachments(nodes[1:4], [(first, "robot"), (last, "server")]),
     )
 
 
@@ -185,15 +174,9 @@ def chain(length: int, mtu: int = MTU_BYTES) -> Topology:
     """
     _require(length >= 1, "a chain has at least one switch")
     nodes = tuple(f"s{number}" for number in range(1, length + 1))
-    return Topology(
-        links=tuple(Link(a, b, mtu=mtu) for a, b in pairwise(nodes)),
-        domains=(DomainPlan("chain", nodes),),
-        attachments=(
-            Attachment(nodes[length // 2], "rib", "rib"),
-            Attachment(nodes[0], "proxy", "left"),
-            Attachment(nodes[-1], "proxy", "right"),
-        ),
-    )
+    ends = [(nodes[0], "left"), (nodes[-1], "right")]
+    links = tuple(Link(a, b, mtu=mtu) for a, b in pairwise(nodes))
+    return Topology(links, (DomainPlan("chain", nodes),), _attachments([nodes[length // 2]], ends))
 
 
 LEFT: Final = "a"
@@ -235,7 +218,7 @@ def make_topology(
     )
     made = [Link(*ends_of(each)) if isinstance(each, str) else each for each in links]
     leads = [Link(member, home) for member, home in members.items()]
-    return Topology((*made, *leads), plans, _attachments(ribs, members)), tuple(members)
+    return Topology((*made, *leads), plans, _attachments(ribs, [(each, "end") for each in members])), tuple(members)
 
 
 def flat_topology(
@@ -249,7 +232,7 @@ def flat_topology(
     pairs = list(links)
     nodes = tuple(dict.fromkeys((*switches, *(end for pair in pairs for end in pair))))
     made = tuple(Link(a, b, mtu=mtu) for a, b in pairs)
-    return Topology(made, (DomainPlan(_DOMAIN, nodes),), _attachments([rib], members))
+    return Topology(made, (DomainPlan(_DOMAIN, nodes),), _attachments([rib], [(each, "end") for each in members]))
 
 
 def row(mtu: int) -> Topology:
@@ -262,8 +245,9 @@ def single(node: str) -> Topology:
     return Topology((), (DomainPlan(_DOMAIN, (node,)),), ())
 
 
-def _attachments(ribs: Iterable[str], members: Iterable[str]) -> tuple[Attachment, ...]:
+def _attachments(ribs: Iterable[str], proxies: Iterable[tuple[str, str]]) -> tuple[Attachment, ...]:
+    """Return RIBs by their switches, and proxies by switch and device."""
     return (
         *(Attachment(switch, "rib", "rib") for switch in ribs),
-        *(Attachment(member, "proxy", "end") for member in members),
+        *(Attachment(switch, "proxy", device) for switch, device in proxies),
     )

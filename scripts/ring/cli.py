@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from itertools import zip_longest
@@ -27,50 +26,26 @@ from lab.cores import CORES_HELP
 from lab.credentials import METRICS_PORTS
 from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
-from ring.faults import cut_from_text, kill_from_text, roam_from_text
+from ring.faults import fault_from_text
 from ring.live_run import LiveRing
 from ring.nodes.content import CAMERA_HZ
 from ring.options import LIVE_S, Live, Options, RingPlane
 from ring.overlay import Overlay
-from ring.progress import ProgressReporter
 from ring.result import Result
 from ring.run import DEMO_S, Ring, make_demo
 from ring.table import summary, table
+from ring.traffic import ProgressReporter
 
 
-def hints(ring: Ring | LiveRing) -> list[tuple[str, str]]:
-    """Start again what has ended, and return pairs of (effect, command line) in the recommended order."""
-    if isinstance(ring, LiveRing):
-        ring.go_on()
-        return [*live_hints(ring), *common(ring.overlay)]
-    replay, again = Path(sys.executable).with_name("gdp-replay"), ring.start_again()
-    config = ring.overlay.credentials.file("proxy", ring.overlay.robot.switch)
-    sender = f"{replay} {shlex.quote(str(ring.bag))} --config {config}"
-    return [(f"send the recording again, into {again}", inside(ring.overlay, "nuc1", sender)), *common(ring.overlay)]
-
-
-def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
-    """Return the pairs that apply to a live ring alone."""
-    found = []
-    for at, graph in zip(("nuc1", "nuc5"), ring.graphs, strict=True):
-        if graph.ros == 1:
-            found.append((f"the topics at {at}", inside(ring.overlay, at, "rostopic list")))
-            found.append((f"what is said at {at}", inside(ring.overlay, at, "rostopic echo -n 5 /chatter")))
-        else:
-            variables = " ".join(f"{name}={value}" for name, value in ring.environment(graph).items())
-            listener = f"env {variables} timeout 5 {sys.executable} -m ring.nodes 2 listener 0"
-            found.append((f"one more listener at {at}, for five seconds", inside(ring.overlay, at, listener)))
-    proxy = inside(ring.overlay, "nuc5", _metrics("proxy"))
-    return [*found, ("what the proxy at nuc5 counts", proxy), ("what all log", f"tail -n 3 {ring.directory}/*.log")]
-
-
-def common(overlay: Overlay) -> list[tuple[str, str]]:
-    """Return the pairs that apply to every ring."""
+def hints(overlay: Overlay) -> list[tuple[str, str]]:
+    """Return pairs of (effect, command line) for a ring that was kept."""
     script = Path(__file__).parents[2] / "scripts" / "ring_topology.sh"
+    metrics = f"curl -s http://127.0.0.1:{METRICS_PORTS['switch']}/metrics"
     return [
-        ("what the switch in the middle counts", inside(overlay, "nuc3", _metrics("switch"))),
+        ("what the switch in the middle counts", inside(overlay, "nuc3", metrics)),
         ("what passes it", inside(overlay, "nuc3", "tcpdump -e -i nuc4 ether proto 0x88b5")),
         ("cut the usual way, and watch the other be taken", inside(overlay, "nuc2", "ip link set nuc3 down")),
+        ("what all log", f"tail -n 3 {overlay.lab.directory}/*.log"),
         ("take everything down", f"{script} --down"),
     ]
 
@@ -81,10 +56,6 @@ def inside(overlay: Overlay, node: str, command: str) -> str:
         return f"ip netns exec {overlay.lab.namespaces[node].path.name} {command}"
     pid = overlay.nodes.running["switch", node].pid
     return f"nsenter --target {pid} --user --mount --net --preserve-credentials {command}"
-
-
-def _metrics(role: str) -> str:
-    return f"curl -s http://127.0.0.1:{METRICS_PORTS[role]}/metrics"
 
 
 ENCODINGS: Final[tuple[Encoding, ...]] = get_args(Encoding)
@@ -176,10 +147,10 @@ def ring(
             out=_absolute(out),
             json=_absolute(json_file),
             pcap=_absolute(pcap),
-            faults=(
-                *map(cut_from_text, cut or ()),
-                *map(roam_from_text, roam or ()),
-                *map(kill_from_text, kill or ()),
+            faults=tuple(
+                fault_from_text(option, each)
+                for option, given in (("cut", cut), ("roam", roam), ("kill", kill))
+                for each in given or ()
             ),
             lease_s=lease,
             keep=keep,
@@ -232,10 +203,16 @@ def _go(options: Options, run: Run, errors: Console) -> int:
     with ProgressReporter(errors) as reporter:
         ring = _ring(options, run, reporter)
         result = ring.result()
-    _show(result, is_wide=options.wide)
+    output = console_of(columns=_WIDE_COLUMNS if options.wide else _COLUMNS)
+    output.print(table(result, is_wide=options.wide))
+    output.print(summary(result), highlight=False, soft_wrap=True)
     _write(options, result, ring.recording if isinstance(ring, Ring) else None)
     if options.keep:
-        _hint(run, hints(ring), errors)
+        if isinstance(ring, LiveRing):
+            ring.go_on()
+        errors.print(f"\nThe ring of run {run.id} stands. Try:", highlight=False)
+        for purpose, command in hints(ring.overlay):
+            errors.print(f"  [dim]# {escape(purpose)}[/dim]\n  {escape(command)}", highlight=False, soft_wrap=True)
     return PASSED if result.passed else FAILED
 
 
@@ -250,18 +227,6 @@ def _ring(options: Options, run: Run, reporter: ProgressReporter) -> Ring | Live
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
     return Ring(options, run, reporter, bag)
-
-
-def _hint(run: Run, hinted: Sequence[tuple[str, str]], errors: Console) -> None:
-    errors.print(f"\nThe ring of run {run.id} stands. Try:", highlight=False)
-    for purpose, command in hinted:
-        errors.print(f"  [dim]# {escape(purpose)}[/dim]\n  {escape(command)}", highlight=False, soft_wrap=True)
-
-
-def _show(result: Result, *, is_wide: bool) -> None:
-    output = console_of(columns=_WIDE_COLUMNS if is_wide else _COLUMNS)
-    output.print(table(result, is_wide=is_wide))
-    output.print(summary(result), highlight=False, soft_wrap=True)
 
 
 def _write(options: Options, result: Result, recording: Path | None = None) -> None:

@@ -19,51 +19,37 @@ CUT, ROAM = FaultKind.CUT, FaultKind.ROAM
 _KILLS: Final = {"rib": FaultKind.KILL_RIB, "switch": FaultKind.KILL_SWITCH}
 _SECONDS: Final = r"(\d+(?:\.\d+)?)"
 _SPAN: Final = rf"@{_SECONDS}(?:-{_SECONDS})?\Z"
-_CUT: Final = re.compile(rf"([^@]+?)-([^@-]+){_SPAN}")
-_KILL: Final = re.compile(rf"({'|'.join(_KILLS)}):([^@:]+){_SPAN}")
-_ROAM: Final = re.compile(rf"([^@:]+):([^@:]+)@{_SECONDS}\Z")
+_WRITTEN: Final = {  # by option
+    "cut": (rf"([^@]+?)-([^@-]+){_SPAN}", "a cut is written like nuc2-nuc3@5, or nuc2-nuc3@5-20 (link, seconds)"),
+    "roam": (rf"([^@:]+):([^@:]+)@{_SECONDS}\Z", "roaming is written like robot:nuc3@10 (proxy, new switch, seconds)"),
+    "kill": (
+        rf"({'|'.join(_KILLS)}):([^@:]+){_SPAN}",
+        "a kill is written like rib:school@8, switch:nuc3@10 or switch:nuc3@10-20 (domain of the RIB or name of the"
+        " switch, seconds)",
+    ),
+}
 
 
-def cut_from_text(text: str) -> Fault:
-    """Parse ``nuc2-nuc3@5`` or ``nuc2-nuc3@5-20``.
+def fault_from_text(option: str, text: str) -> Fault:
+    """Parse the value of an option: ``cut``, ``roam`` or ``kill``.
 
-    Raises ``LocalError``: anything else, or a link that comes up before it goes down.
+    Raises ``LocalError``: it is written otherwise, or what is hit comes back before it goes.
     """
-    found = _CUT.match(text)
+    pattern, written = _WRITTEN[option]
+    found = re.match(pattern, text)
     if found is None:
-        raise LocalError(
-            f"a cut is written like nuc2-nuc3@5, or nuc2-nuc3@5-20 (link, seconds after the start), not {text!r}"
-        )
-    return Fault(CUT, (found[1], found[2]), *_span(found))
-
-
-def kill_from_text(text: str) -> Fault:
-    """Parse ``rib:school@8``, ``switch:nuc3@10`` or ``switch:nuc3@10-20``.
-
-    Raises ``LocalError``: anything else, or a process that restarts before it is killed.
-    """
-    found = _KILL.match(text)
-    if found is None:
-        raise LocalError(
-            "a kill is written like rib:school@8, switch:nuc3@10 or switch:nuc3@10-20 (domain of the RIB or name"
-            f" of the switch, seconds after the start), not {text!r}"
-        )
-    return Fault(_KILLS[found[1]], (f"{found[1]} {found[2]}",), *_span(found))
-
-
-def roam_from_text(text: str) -> Fault:
-    """Parse ``robot:nuc3@10``: a proxy's device and its new switch. Raises ``LocalError``: anything else."""
-    found = _ROAM.match(text)
-    if found is None:
-        raise LocalError(f"roaming is written like robot:nuc3@10 (proxy, new switch, seconds), not {text!r}")
-    return Fault(ROAM, (found[1], found[2]), float(found[3]), float(found[3]))
-
-
-def _span(found: re.Match[str]) -> tuple[float, float]:
-    start_s, end_s = float(found[3]), float(found[4] or math.inf)
+        raise LocalError(f"{written}, not {text!r}")
+    one, other, start_s = found[1], found[2], float(found[3])
+    if option == "roam":
+        return Fault(ROAM, (one, other), start_s, start_s)
+    end_s = float(found[4] or math.inf)
     if end_s <= start_s:
-        raise LocalError(f"{found[0]}: it comes back before it goes")
-    return start_s, end_s
+        raise LocalError(f"{text}: it comes back before it goes")
+    return (
+        Fault(CUT, (one, other), start_s, end_s)
+        if option == "cut"
+        else Fault(_KILLS[one], (f"{one} {other}",), start_s, end_s)
+    )
 
 
 def text_of(fault: Fault) -> str:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from lab.credentials import Carried, Yaml
+from lab.dds import ros_environment
 from proxy.config.config import Encoding
 from proxy.serial.channel import RosVersion
 from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, TALKS
@@ -38,27 +38,16 @@ class Graph:
             return {"endpoint": "ros1", "master": self._master}
         return {"endpoint": "ros2", "domain": self.domain}
 
-    def environment(self, logs: Path, profiles: Path) -> Mapping[str, str]:
-        """Return the environment of its nodes and its proxy.
+    def environment(self, folder: Path) -> list[str]:
+        """Return the environment of its nodes and its proxy, as ``KEY=value``.
 
-        Fast DDS's shared memory is disabled: it crosses the network namespaces of a machine. So ROS 2 is not set to
-        LOCALHOST, which would enable it again; the namespace has no other network anyway.
-
-        Args:
-            logs: directory for ROS's logs.
+        ``folder``: for a profile, and for ROS's logs.
         """
-        if self.ros == 1:
-            return {"ROS_MASTER_URI": self._master, "ROS_HOSTNAME": "127.0.0.1", "ROS_LOG_DIR": str(logs)}
-        return {
-            "ROS_DOMAIN_ID": str(self.domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-            "ROS_LOCALHOST_ONLY": "",
-            "ROS_STATIC_PEERS": "",
-            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-            "FASTRTPS_DEFAULT_PROFILES_FILE": str(profiles),
-            "FASTDDS_DEFAULT_PROFILES_FILE": str(profiles),
-            "ROS_LOG_DIR": str(logs),
-        }
+        ros1 = [f"ROS_MASTER_URI={self._master}", "ROS_HOSTNAME=127.0.0.1"]
+        return [
+            *(ros1 if self.ros == 1 else ros_environment(folder, self.domain)),
+            f"ROS_LOG_DIR={folder / 'ros-logs'}",
+        ]
 
     @property
     def _master(self) -> str:

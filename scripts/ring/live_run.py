@@ -6,7 +6,7 @@ import importlib.util
 import signal
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -14,7 +14,6 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from lab.credentials import Side
-from lab.dds import UDP_PROFILE
 from lab.process import Event, LabProcess
 from lab.supervisor import Supervisor
 from lab.topology import Attachment
@@ -23,106 +22,85 @@ from ring.live_plan import MASTER_PORT, Graph, calls_in, carried_in, graphs_of, 
 from ring.nodes.content import LAMP
 from ring.options import Live, Options
 from ring.overlay import Injection, Overlay
-from ring.progress import ProgressReporter, Traffic
 from ring.result import Heard, Result, rows
-from ring.silence import Silence
+from ring.traffic import ProgressReporter, Traffic
 
 MEET_S: Final = 60.0
 ENDING_S: Final = 30.0
 QUIET_S: Final = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class LiveNodes:
-    """The nodes of a live run, all ready. ``talkers``: number of messages that each will publish."""
-
-    talkers: Mapping[LabProcess, int]
-    lamp: LabProcess
-    listener: LabProcess
-    caller: LabProcess
-    calls: int
-
-    @property
-    def messages(self) -> int:
-        """Return the total number of messages to be published."""
-        return sum(self.talkers.values())
+_FIXED: Final = ("lamp", "listener", "caller")  # nodes that are no talkers
 
 
 class LiveSession:
-    """One run's traffic. ``supervisor`` watches the nodes."""
+    """One run's traffic, between nodes that are ready.
 
-    def __init__(self, supervisor: Supervisor, live_nodes: LiveNodes, reporter: ProgressReporter) -> None:
+    Args:
+        supervisor: watches the nodes.
+        nodes: by name: ``lamp``, ``listener``, ``caller``, and the talkers.
+        messages: that the talkers will publish.
+        calls: that the caller will make.
+    """
+
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        nodes: Mapping[str, LabProcess],
+        messages: int,
+        calls: int,
+        reporter: ProgressReporter,
+    ) -> None:
         self._supervisor = supervisor
-        self._live_nodes = live_nodes
+        self._lamp, self._listener, self._caller = (nodes[name] for name in _FIXED)
+        self._talkers = [node for name, node in nodes.items() if name not in _FIXED]
+        self._messages = messages
         self._reporter = reporter
-        self._sent: dict[LabProcess, int] = {}
-        self._received: dict[str, int] = {}
-        self._asked = 0
-        self._answered = 0
-        self.silence = Silence()
-        self._latency_ms: float | None = None
-        self._has_moved = False
-        for node in (*live_nodes.talkers, live_nodes.listener, live_nodes.caller):
+        self.traffic = Traffic(messages + calls)
+        for node in (*self._talkers, self._listener, self._caller):
             supervisor.hear(node, self._note)
 
     def meet(self) -> None:
         """Wait until the remote side receives every topic and discovers the service."""
-        for node in (self._live_nodes.listener, self._live_nodes.caller):
+        for node in (self._listener, self._caller):
             self._supervisor.wait_for(node, "hears", MEET_S)
 
     def talk(self, seconds: float) -> Heard:
         """Run the traffic for this long, wait for messages under way, and return each node's report."""
-        nodes, done = self._live_nodes, partial(self._supervisor.wait_for, name="done")
-        self._reporter.begin_traffic(nodes.messages + nodes.calls)
+        done = partial(self._supervisor.wait_for, name="done")
+        self._reporter.begin_traffic(self.traffic.total)
         try:
-            for node in (*nodes.talkers, nodes.caller):
+            for node in (*self._talkers, self._caller):
                 node.send(signal.SIGUSR1)
-            said = [done(node, patience_s=seconds + ENDING_S) for node in nodes.talkers]
-            called = done(nodes.caller, patience_s=ENDING_S)
-            self._answered = called["answered"]
-            self._await_quiet()
-            for node in (nodes.lamp, nodes.listener):
+            said = [done(node, patience_s=seconds + ENDING_S) for node in self._talkers]
+            called = done(self._caller, patience_s=ENDING_S)
+            self.traffic.note_received(LAMP, called["answered"], time.monotonic())
+            self._await_quiet(self._messages + called["answered"])
+            for node in (self._lamp, self._listener):
                 node.send(signal.SIGINT)
-            served, heard = (done(node, patience_s=ENDING_S) for node in (nodes.lamp, nodes.listener))
+            served, heard = (done(node, patience_s=ENDING_S) for node in (self._lamp, self._listener))
         finally:
             self._reporter.close()
         return Heard(tuple(said), served, heard, called)
 
-    def _await_quiet(self) -> None:
+    def _await_quiet(self, wanted: int) -> None:
         """Wait until everything arrived, or nothing arrived for a while."""
-        while sum(self._received.values()) < self._live_nodes.messages:
-            self._has_moved = False
-            if not self._supervisor.follow(lambda: self._has_moved, QUIET_S):
-                return
+        moved = True
+        while moved and (before := self.traffic.received) < wanted:
+            moved = self._supervisor.follow(lambda: self.traffic.received != before, QUIET_S)
 
     def _note(self, child: LabProcess, event: Event) -> None:
         if event["event"] != "progress":
             return
-        now_s, silence = time.monotonic(), self.silence
-        if child is self._live_nodes.listener:
-            received = {each["topic"]: each["received"] for each in event["topics"]}
-            self._has_moved |= received != self._received
-            for topic, count in received.items():
-                silence.received(topic, count, now_s)
-            self._received = received
-            self._latency_ms = event.get("latency_ms")
-        elif child is self._live_nodes.caller:
-            self._asked, self._answered = event["asked"], event["answered"]
-            silence.sent(LAMP, self._asked, now_s)
-            silence.received(LAMP, self._answered, now_s)
+        now_s, traffic = time.monotonic(), self.traffic
+        if child is self._listener:
+            for each in event["topics"]:
+                traffic.note_received(each["topic"], each["received"], now_s)
+            traffic.latency_ms = event.get("latency_ms")
+        elif child is self._caller:
+            traffic.note_sent(LAMP, event["asked"], now_s)
+            traffic.note_received(LAMP, event["answered"], now_s)
         else:
-            self._sent[child] = event["sent"]
-            silence.sent(event["topic"], event["sent"], now_s)
-        self._reporter.traffic(
-            Traffic(
-                total=self._live_nodes.messages + self._live_nodes.calls,
-                sent=sum(self._sent.values()) + self._asked,
-                received=sum(self._received.values()) + self._answered,
-                behind=silence.behind,
-                silent=tuple(silence.silent(now_s)),
-                latency_ms=self._latency_ms,
-            )
-        )
+            traffic.note_sent(event["topic"], event["sent"], now_s)
+        self._reporter.traffic(traffic)
 
 
 _ROS2: Final = ("rclpy", "std_msgs", "sensor_msgs", "nav_msgs", "std_srvs")
@@ -141,22 +119,20 @@ class LiveRing:
         self._options = options
         self._run = run
         self._reporter = reporter
-        self._profiles = run.directory / "fast-dds.xml"
-        self._profiles.write_text(UDP_PROFILE, encoding="utf-8")
         self.overlay = Overlay(options, run, reporter)
         self._ends = tuple(zip((self.overlay.robot, self.overlay.server), self.graphs, _SIDES, strict=True))
         self._proxies: list[LabProcess] = []
-        self._nodes: list[LabProcess] = []
+        self._nodes: dict[str, LabProcess] = {}
 
     def result(self) -> Result:
         """Run the traffic between robot and server, and compare."""
         overlay, supervisor = self.overlay, self.overlay.supervisor
         overlay.stand_up()
-        argv = ["-m", "ring.nodes.master", str(MASTER_PORT)]
+        argv = ["-m", "ring.nodes", "1", "master", str(MASTER_PORT)]
         supervisor.ready(*(self._start(at, graph, "master", argv) for at, graph, _ in self._ends if graph.ros == 1))
         self._proxies = [self._start_proxy(*end) for end in self._ends]
         supervisor.ready(*self._proxies)
-        session = LiveSession(supervisor, self._live_nodes(), self._reporter)
+        session = self._start_nodes()
         session.meet()
         self._reporter.step(f"they hear each other; {self._options.live_s:g} s of traffic")
         injection, begun_s = Injection(supervisor, self._options.faults, overlay.inject), time.monotonic()
@@ -167,41 +143,30 @@ class LiveRing:
         traffic_s = time.monotonic() - begun_s
         self._reporter.step("comparing what was published with what was heard")
         result = self._compare(heard, complaints)
-        return replace(result, traffic_s=traffic_s, silent_s=session.silence.longest_s)
+        return replace(result, traffic_s=traffic_s, silent_s=session.traffic.longest_s)
 
     def go_on(self) -> None:
         """Replace the proxies that have reported by ones that outlive this process, and continue the nodes' traffic."""
         for end in self._ends:
             self._start_proxy(*end, heard=False)
-        for node in self._nodes:
+        for node in self._nodes.values():
             node.send(signal.SIGUSR1)
 
-    @property
-    def directory(self) -> Path:
-        """Return the directory of the processes' logs."""
-        return self._run.directory
-
-    def environment(self, graph: Graph) -> Mapping[str, str]:
-        """Return the environment of the processes in a graph."""
-        return graph.environment(self._run.directory / "ros-logs", self._profiles)
-
-    def _live_nodes(self) -> LiveNodes:
+    def _start_nodes(self) -> LiveSession:
         """Start the nodes; return when all are ready."""
         (robot, at_robot, _), (server, at_server, _) = self._ends
         seconds, talking = self._options.live_s, paces(self._options.camera_hz)
+        counts = {name: messages_in(seconds, hz) for name, hz in talking.items()}
         calls = calls_in(seconds)
         self._reporter.step(f"starting nodes at {robot.switch}, ROS {at_robot.ros}: {', '.join(talking)}, lamp")
         self._reporter.step(f"starting nodes at {server.switch}, ROS {at_server.ros}: listener, caller")
-        talkers = dict[LabProcess, int]()
-        for name, hz in talking.items():
-            count = messages_in(seconds, hz)
-            talkers[self._start_node(robot, at_robot, name, count, hz)] = count
-        lamp = self._start_node(robot, at_robot, "lamp", 0)
-        listener = self._start_node(server, at_server, "listener", 0)
-        caller = self._start_node(server, at_server, "caller", calls)
-        self._nodes = [*talkers, lamp, listener, caller]
-        self.overlay.supervisor.ready(*self._nodes)
-        return LiveNodes(talkers, lamp, listener, caller, calls)
+        words = {name: [str(counts[name]), str(hz)] for name, hz in talking.items()}
+        words |= {"lamp": ["0"], "listener": ["0"], "caller": [str(calls)]}
+        for name, more in words.items():
+            at, graph = (server, at_server) if name in ("listener", "caller") else (robot, at_robot)
+            self._nodes[name] = self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, *more])
+        self.overlay.supervisor.ready(*self._nodes.values())
+        return LiveSession(self.overlay.supervisor, self._nodes, sum(counts.values()), calls, self._reporter)
 
     def _compare(self, heard: Heard, complaints: list[str]) -> Result:
         said = [self._finish(proxy) for proxy in self._proxies]
@@ -221,15 +186,10 @@ class LiveRing:
     def _start_proxy(self, at: Attachment, graph: Graph, side: Side, *, heard: bool = True) -> LabProcess:
         carried = {side: carried_in(self._options.encoding)}
         config = self.overlay.credentials.proxy(at, carried, ros=graph.to_yaml())
-        argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
-        return self._start(at, graph, "proxy", argv, heard=heard)
+        return self.overlay.start_proxy(at.switch, config, graph.environment(self._run.directory), heard=heard)
 
-    def _start_node(self, at: Attachment, graph: Graph, name: str, count: int, hz: float | None = None) -> LabProcess:
-        pace = [] if hz is None else [str(hz)]
-        return self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, str(count), *pace])
-
-    def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str], *, heard: bool = True) -> LabProcess:
-        return self.overlay.start(at.switch, role, argv, heard=heard, environment=self.environment(graph))
+    def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str]) -> LabProcess:
+        return self.overlay.lab.start(at.switch, role, argv, graph.environment(self._run.directory))
 
 
 def _require(versions: set[int]) -> None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final, Literal
 
 from gdp.errors import LocalError
@@ -21,7 +22,7 @@ from lab.process import LabProcess
 from lab.supervisor import READY_S, Supervisor
 from ring.faults import CUT, ROAM, roamers, text_of, victims
 from ring.options import Options
-from ring.progress import ProgressReporter
+from ring.traffic import ProgressReporter
 
 _MIDDLE: Final = "nuc3"
 _RIB_WORDS: Final = ("--await-iface", f"{READY_S:g}")
@@ -67,34 +68,21 @@ class Overlay:
         """Start switches and RIBs; return when all are ready."""
         if self.options.pcap is not None:
             argv = ["-m", "ring.capture", str(self.options.pcap), *self.topology.neighbours(_MIDDLE)]
-            self.supervisor.ready(self.start(_MIDDLE, "capture", argv))
-        self.reporter.step("starting a switch in each")
-        for node in self.topology.nodes:
-            self.credentials.switch(node, self.options.data_plane)
-        said = self.nodes.start_all("switch", self.topology.nodes)
+            self.supervisor.ready(self.lab.start(_MIDDLE, "capture", argv))
+        self.reporter.step("starting a switch in each, and the RIB of each domain")
+        said = self.nodes.stand_up(self.topology.nodes, self.options.data_plane, *_RIB_WORDS)
         self._planes = sorted({str(each["data_plane"]) for each in said})
         for reason in sorted({str(each["reason"]) for each in said} - {""}):
             self.reporter.step(f"data plane {', '.join(self._planes)}: {reason}")
-        self.reporter.step("starting the RIB of each domain")
-        ribs = self.topology.attached("rib")
-        for at in ribs:
-            self.credentials.rib(at)
-        self.nodes.start_all("rib", [at.switch for at in ribs], *_RIB_WORDS)
         self.supervisor.require(*self.nodes.running.values())
         self.reporter.step(f"starting the proxies at {self.robot.switch} and {self.server.switch}")
 
-    def start(
-        self,
-        node: str,
-        role: str,
-        arguments: Sequence[str],
-        environment: Mapping[str, str] | None = None,
-        *,
-        heard: bool = True,
+    def start_proxy(
+        self, node: str, config: Path, environment: Sequence[str] = (), *, heard: bool = True
     ) -> LabProcess:
-        """Start Python with these arguments at a switch; ``environment`` extends the present one."""
-        variables = [f"{name}={value}" for name, value in (environment or {}).items()]
-        return self.lab.start(node, role, arguments, variables, heard=heard)
+        """Start a proxy at a switch; one that is not heard outlives this process."""
+        argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
+        return self.lab.start(node, "proxy", argv, environment, heard=heard)
 
     def inject(self, fault: Fault, *, begins: bool) -> None:
         """Begin a fault, or end it. Raises ``LocalError``: the kernel refuses."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, field, fields
+from functools import partial
 
 from gdp.errors import LocalError
 from lab.process import Event
@@ -16,29 +17,24 @@ class Journey:
     """Measurements of the receiver on one topic.
 
     Args:
+        latency_ms: median, p99 and max; None: not measured.
         parts: fragments of the largest message.
         hops: switches that most messages passed.
         hops_seen: every number of switches that some message passed.
         silent_ms: the longest time between two messages, or between two answers; None: not measured.
     """
 
-    median_ms: float | None = None
-    p99_ms: float | None = None
-    max_ms: float | None = None
     duplicated: int = 0
+    latency_ms: Mapping[str, float | None] = field(default_factory=partial(dict.fromkeys, ("median", "p99", "max")))
+    silent_ms: float | None = None
     parts: int = 0
     hops: int = 0
-    hops_seen: tuple[int, ...] = ()
-    silent_ms: float | None = None
+    hops_seen: Sequence[int] = ()
 
     @classmethod
     def from_event(cls, topic: Event) -> Journey:
         """Read one entry of a receiver's report, or what a caller reports."""
-        return cls(
-            **{f"{key}_ms": value for key, value in (topic.get("latency_ms") or {}).items()},
-            **{key: topic[key] for key in ("duplicated", "parts", "hops", "silent_ms") if key in topic},
-            hops_seen=tuple(topic.get("hops_seen", ())),
-        )
+        return cls(**{each.name: topic[each.name] for each in fields(cls) if topic.get(each.name) is not None})
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,24 +67,10 @@ class TopicResult:
 
     def to_json(self) -> dict[str, object]:
         """Return the row for ``--json``."""
-        of, way = self.comparison, self.journey
-        return {
-            "topic": of.topic,
-            "kind": "service" if self.is_service else "topic",
-            "type": of.type_name,
-            "messages": of.messages,
-            "bytes": of.bytes,
-            "delivered": of.delivered,
-            "lost": of.lost,
-            "duplicated": self.duplicated,
-            "identical": of.identical,
-            "in_order": of.in_order,
-            "latency_ms": {"median": way.median_ms, "p99": way.p99_ms, "max": way.max_ms},
-            "silent_ms": way.silent_ms,
-            "parts": way.parts,
-            "hops": way.hops,
-            "hops_seen": list(way.hops_seen),
-        }
+        compared = asdict(self.comparison)
+        del compared["altered"]
+        what = {"kind": "service" if self.is_service else "topic", "type": compared.pop("type_name")}
+        return {**compared, **what, **asdict(self.journey), "duplicated": self.duplicated}
 
 
 @dataclass(frozen=True, slots=True)

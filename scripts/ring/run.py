@@ -14,7 +14,7 @@ from gdp.errors import ConfigError
 from gdp.host.run_registry import Run
 from lab.credentials import Carried
 from lab.process import Event, FailedError, LabProcess
-from lab.supervisor import READY_S, Supervisor, exit_code, failed
+from lab.supervisor import READY_S, TAIL, Supervisor, exit_code
 from proxy.config.config import Encoding
 from proxy.recordings.compare import compare
 from proxy.recordings.reader import BagReader
@@ -22,9 +22,8 @@ from proxy.serial.channel import Channel, RosVersion
 from ring.live_plan import AUTHOR
 from ring.options import Options
 from ring.overlay import Injection, Overlay
-from ring.progress import ProgressReporter, Traffic
 from ring.result import Result, put_together
-from ring.silence import Silence
+from ring.traffic import ProgressReporter, Traffic
 
 ENDING_S: Final = 30.0  # to close a recording, or to get the last acknowledgements
 STALL_S: Final = 30.0
@@ -45,10 +44,7 @@ class Replay:
         self._sender = sender
         self._receiver = receiver
         self._reporter = reporter
-        self._traffic = Traffic(total=total)
-        self._silence = Silence()
-        self._unconfirmed = ""  # names of topics
-        self._has_moved = False
+        self._traffic = Traffic(total)
         self.topics: tuple[Event, ...] = ()
         for each in (sender, receiver):
             supervisor.hear(each, self._follow)
@@ -59,14 +55,13 @@ class Replay:
         begun_s = time.monotonic()
         try:
             while not self._sender.is_silent:
-                self._has_moved = False
-                if not self._supervisor.follow(lambda: self._has_moved or self._sender.is_silent, STALL_S):
-                    raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0)}")
+                if not self._moves():
+                    raise FailedError(f"nothing moved for {STALL_S:g} s: {self._traffic.words(0.0, time.monotonic())}")
             traffic_s = time.monotonic() - begun_s
             sender_code = exit_code(self._sender, ENDING_S)
             sent = self._supervisor.said(self._sender, "done")
             if sent is None:
-                raise failed(self._sender, f"ended with code {sender_code} in the middle")
+                raise self._sender.failed(f"ended with code {sender_code} in the middle", TAIL)
             self._supervisor.release(self._receiver)
             self._receiver.send(signal.SIGINT)
             received = self._supervisor.wait_for(self._receiver, "done", ENDING_S)
@@ -79,27 +74,25 @@ class Replay:
         complaints += [f"the receiver ended with code {receiver_code}"] if receiver_code else []
         unread = sent.get("unread") or None
         self.topics = tuple(received["topics"])
-        longest_s = self._silence.longest_s
+        longest_s = self._traffic.longest_s
         return Result((), {}, unread=unread, complaints=tuple(complaints), traffic_s=traffic_s, silent_s=longest_s)
+
+    def _moves(self) -> bool:
+        before = self._traffic.changes
+        return self._supervisor.follow(lambda: self._traffic.changes != before or self._sender.is_silent, STALL_S)
 
     def _follow(self, _: LabProcess, event: Event) -> None:
         if event["event"] != "progress":
             return
-        before, now_s = self._traffic, time.monotonic()
+        traffic, now_s = self._traffic, time.monotonic()
         if "sent" in event:
-            self._silence.sent(_ALL, event["sent"], now_s)
-            self._unconfirmed = ", ".join(event.get("unconfirmed", {}))
-            self._traffic = replace(before, sent=event["sent"])
-            waiting = before.sent < before.total  # for the next stamp of the recording, which may have long pauses
+            traffic.changes += traffic.sent < traffic.total  # it waits for the next stamp; a recording may have pauses
+            traffic.label = ", ".join(event.get("unconfirmed", {}))
+            traffic.note_sent(_ALL, event["sent"], now_s)
         else:
-            received, lost = event["received"], event["lost"]
-            latency_ms = event.get("latency_ms")
-            self._silence.received(_ALL, received + lost, now_s)
-            self._traffic = replace(before, received=received, lost=lost, latency_ms=latency_ms)
-            waiting = False
-        self._has_moved |= waiting or self._traffic != before
-        silent = tuple((self._unconfirmed or flow, seconds) for flow, seconds in self._silence.silent(now_s))
-        self._reporter.traffic(replace(self._traffic, behind=self._silence.behind, silent=silent))
+            traffic.lost, traffic.latency_ms = event["lost"], event.get("latency_ms")
+            traffic.note_received(_ALL, event["received"] + event["lost"], now_s)
+        self._reporter.traffic(traffic)
 
 
 def _not_confirmed(topic: Event) -> str:
@@ -145,7 +138,7 @@ class Ring:
         """Send the recording through the ring, and compare."""
         overlay, supervisor = self.overlay, self.overlay.supervisor
         overlay.stand_up()
-        receiver = self._start_receiver(self.recording)
+        receiver = self._start_receiver()
         supervisor.ready(receiver)
         self._reporter.step(f"replaying {self._total} messages at {overlay.robot.switch}")
         sender = self._start_sender()
@@ -156,23 +149,19 @@ class Ring:
         comparisons = compare(self.bag, self.recording, exact=self.options.encoding == "cdr")
         return replace(report, topics=put_together(comparisons, replay.topics), settings=overlay.settings)
 
-    def start_again(self) -> Path:
-        """Start a receiver that outlives this process, in place of the ended one; return the path of its recording."""
-        path = self.recording.with_name(f"again-{self.recording.name}")
-        self._start_receiver(path, heard=False)
-        return path
-
-    def _start_receiver(self, record: Path, *, heard: bool = True) -> LabProcess:
-        at, recorded = self.overlay.server, {"path": str(record), "format": "ros1" if self._ros == 1 else "mcap"}
+    def _start_receiver(self) -> LabProcess:
+        at, recorded = (
+            self.overlay.server,
+            {"path": str(self.recording), "format": "ros1" if self._ros == 1 else "mcap"},
+        )
         config = self.overlay.credentials.proxy(at, {"import": self._topics}, record=recorded)
-        argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
-        return self.overlay.start(at.switch, "proxy", argv, heard=heard)
+        return self.overlay.start_proxy(at.switch, config)
 
     def _start_sender(self) -> LabProcess:
         at = self.overlay.robot
         config = self.overlay.credentials.proxy(at, {"expose": self._topics})
         argv = ["-m", "proxy.cli.replay", str(self.bag), "--config", str(config), "--json"]
-        return self.overlay.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
+        return self.overlay.lab.start(at.switch, "replay", [*argv, "--rate", str(self._rate)])
 
 
 def topics_of(channels: Iterable[Channel], encoding: Encoding) -> tuple[Carried, ...]:

@@ -73,10 +73,7 @@ def _cells(row: TopicResult) -> list[str]:
         str(of.lost),
         str(row.duplicated),
         "yes" if of.identical else "no",
-        _ms(way.median_ms),
-        _ms(way.p99_ms),
-        _ms(way.max_ms),
-        _ms(way.silent_ms),
+        *map(_ms, (*way.latency_ms.values(), way.silent_ms)),
         str(way.parts or "-"),
         hops_in_words(way),
     ]

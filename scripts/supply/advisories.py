@@ -43,7 +43,7 @@ def is_affected(advisory: Mapping[str, Any], name: str, version: str) -> bool:
         package = affected.get("package", {})
         if package.get("ecosystem") != "PyPI" or canonicalize_name(package.get("name", "")) != canonicalize_name(name):
             continue
-        if any(_same(version, each) for each in affected.get("versions", ())):
+        if any(same_version(version, each) for each in affected.get("versions", ())):
             return True
         ranges = [each for each in affected.get("ranges", ()) if each.get("type") == "ECOSYSTEM"]
         if any(_spans(each.get("events", ()), version) for each in ranges):
@@ -78,7 +78,8 @@ def _parsed(version: str) -> Version | None:
         return None
 
 
-def _same(one: str, other: str) -> bool:
+def same_version(one: str, other: str) -> bool:
+    """Return whether two texts are one version by PEP 440, or the same text."""
     return one == other or (_parsed(one) is not None and _parsed(one) == _parsed(other))
 
 

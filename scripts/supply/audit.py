@@ -23,10 +23,9 @@ from importlib.metadata import Distribution, distributions
 from pathlib import Path
 from typing import NamedTuple
 
-from advisories import AdvisoryError, is_affected, read_advisories
+from advisories import AdvisoryError, is_affected, read_advisories, same_version
 from locks import LockError, Pin, pins_here, read_lock
 from packaging.utils import canonicalize_name
-from packaging.version import InvalidVersion, Version
 
 OURS = "gdp-ros"
 _METADATA = re.compile(
@@ -57,7 +56,7 @@ def compare(installed: Iterable[Distribution], pins: Sequence[Pin]) -> Iterator[
         if not pinned and name not in _WITH_EVERY_VENV:
             if (name, each.version) not in carried:
                 yield Finding("not-pinned", name, each.version)
-        elif pinned and not any(_equal(pin.version, each.version) for pin in pinned):
+        elif pinned and not any(same_version(pin.version, each.version) for pin in pinned):
             yield Finding("other-version", name, f"{each.version}, pinned {', '.join(pin.version for pin in pinned)}")
 
 
@@ -125,13 +124,6 @@ def _metadata_in(each: Distribution) -> Iterator[tuple[str, str]]:
 
 def _name(each: Distribution) -> str:
     return canonicalize_name(each.metadata["Name"] or "")
-
-
-def _equal(one: str, other: str) -> bool:
-    try:
-        return Version(one) == Version(other)
-    except InvalidVersion:
-        return one == other
 
 
 if __name__ == "__main__":

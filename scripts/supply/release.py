@@ -19,7 +19,6 @@ import gzip
 import hashlib
 import io
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -42,7 +41,6 @@ from gdp.stores.keyring import load_public_key  # noqa: E402
 SUMS = "SHA256SUMS"
 SIGNATURE = "SHA256SUMS.sig"
 LOCK = "requirements/run.lock"
-_LINE = re.compile(r"([0-9a-f]{64})  ([A-Za-z0-9][\w.+\-]*)\Z")
 # The wheel has the burst core, which serves every later Python of its architecture; the source archive has its source.
 _BACKEND = """
 import pathlib, setuptools, setuptools.build_meta as backend, subprocess, sys
@@ -84,8 +82,7 @@ def build(out: Path, root: Path = ROOT, commit: str = "HEAD") -> None:
 
 def write_sums(folder: Path) -> None:
     """Write the SHA-256 of each file of a folder, in the format of sha256sum."""
-    sums = {path.name: _sha256(path) for path in sorted(folder.iterdir()) if path.name not in (SUMS, SIGNATURE)}
-    (folder / SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()))
+    (folder / SUMS).write_text("".join(f"{line}\n" for line in _sums(folder)))
 
 
 def sign(folder: Path, key: Path) -> None:
@@ -144,26 +141,27 @@ def main(words: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _sums(folder: Path) -> list[str]:
+    """Return the lines of a folder's SHA256SUMS, by name."""
+    paths = sorted(path for path in folder.iterdir() if path.name not in (SUMS, SIGNATURE))
+    return [f"{hashlib.sha256(_read(path)).hexdigest()}  {path.name}" for path in paths]
+
+
 def _check_sums(folder: Path) -> list[str]:
     """Return the names of a folder's files, if SHA256SUMS states each of them correctly, and no other.
 
     Raises ``ReleaseError``: otherwise.
     """
-    stated: dict[str, str] = {}
-    for number, line in enumerate(_read(folder / SUMS).decode(errors="replace").splitlines(), 1):
-        match = _LINE.match(line)
-        if match is None or match[2] in stated:
-            raise ReleaseError(f"{folder / SUMS}:{number}: expected a SHA-256, two spaces and a file's name, each once")
-        stated[match[2]] = match[1]
-    if not stated:
-        raise ReleaseError(f"{folder / SUMS} states nothing")
-    present = {path.name for path in folder.iterdir()} - {SUMS, SIGNATURE}
-    for name in sorted(present ^ stated.keys()):
-        raise ReleaseError(f"{name} is {'not listed in ' + SUMS if name in present else 'missing'}")
-    for name, digest in stated.items():
-        if _sha256(folder / name) != digest:
-            raise ReleaseError(f"{name} is not the file that {SUMS} states")
-    return sorted(stated)
+    present, stated = _sums(folder), _read(folder / SUMS).decode(errors="replace").splitlines()
+    for line in stated:
+        if line not in present:
+            raise ReleaseError(f"{line.partition('  ')[2] or line} is missing, or not the file that {SUMS} states")
+    for line in present:
+        if line not in stated:
+            raise ReleaseError(f"{line.partition('  ')[2]} is not listed in {SUMS}")
+    if not present or stated != present:
+        raise ReleaseError(f"{folder / SUMS}: expected a line for each file, by name, and one file or more")
+    return [line.partition("  ")[2] for line in present]
 
 
 @contextlib.contextmanager
@@ -207,10 +205,6 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise ReleaseError(f"{path}: {error.strerror}") from error
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(_read(path)).hexdigest()
 
 
 if __name__ == "__main__":

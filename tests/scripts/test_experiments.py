@@ -130,7 +130,7 @@ def test_a_mask_with_a_region_too_many_or_too_few_or_a_part_of_each_is_wrong() -
 def test_an_answer_is_judged_by_what_the_task_asked_for() -> None:
     needs("scipy", "rcl_interfaces")
     import numpy as np
-    from image_request import answer_of, text_of
+    from frames import answer_of, text_of
     from tasks import TASKS
     from vision import SHAPE, Scene
 
@@ -181,7 +181,7 @@ def test_the_waits_of_figure_six_are_recorded_runs_of_the_network() -> None:
 
 def test_a_frame_comes_through_its_carrier_unchanged() -> None:
     needs("scipy", "rcl_interfaces")
-    from image_request import answer_of, frame_of, mask_in, request_of, said_in, text_of
+    from frames import answer_of, frame_of, mask_in, request_of, said_in, text_of
     from vision import Scene
 
     frame = Scene.draw(2).frame
@@ -193,7 +193,7 @@ def test_a_frame_comes_through_its_carrier_unchanged() -> None:
 
 
 def test_a_drawn_tag_is_found_where_it_is() -> None:
-    needs("pupil_apriltags", "scipy")
+    needs("cv2", "scipy")
     from tag import Pose, TagCamera
 
     camera = TagCamera()
@@ -287,9 +287,10 @@ def test_the_least_of_two_recorded_runs_gains_by_how_rare_the_long_ones_are() ->
 
 def test_a_request_is_lost_only_while_all_its_machines_stay_down() -> None:
     needs("matplotlib")
-    from outages import Outage, share_unanswered
+    from outages import share_unanswered
+    from pictures import Span
 
-    one, other = [Outage(1.0, 4.0)], [Outage(3.0, 8.0)]
+    one, other = [Span("m1", 1.0, 4.0)], [Span("m2", 3.0, 8.0)]
     assert share_unanswered([one], 10.0, 0.0) == pytest.approx(0.3, abs=0.01)
     assert share_unanswered([one], 10.0, 0.5) == pytest.approx(0.25, abs=0.01)
     assert share_unanswered([one, other], 10.0, 0.5) == pytest.approx(0.05, abs=0.01)
@@ -320,18 +321,22 @@ def test_the_table_of_both_papers_is_of_the_shipped_figures() -> None:
 def test_a_text_has_one_line_for_each_paragraph_and_each_item_of_a_list() -> None:
     from page_text import text_of
 
-    lines = text_of("outages", up_s=9.0, down_s=3.0, patience_s=0.5).splitlines()
-    assert [line[:12] for line in lines] == ["A robot asks", "", "*By the list", "", "- The paper'", "- The machin"]
-    assert "means of 9 s and 3 s, drawn before" in lines[0]
+    figures = {"up_s": 9.0, "down_s": 3.0, "patience_s": 0.5}
+    lines = text_of("outages", latencies="rows", findings="more", **figures).splitlines()
+    assert [line[:12] for line in lines if line] == [
+        "# Availabili", "A robot asks", "*By the list", "```bash", "sudo .venv/b", "```", "![Availabili", "rows",
+        "more", "- The paper'", "- The machin",
+    ]  # fmt: skip
+    assert "means of 9 s and 3 s, drawn before" in lines[2]
 
 
 def test_the_page_of_table_one_and_figure_five_is_of_the_shipped_figures() -> None:
-    from experiment import Computed
+    from experiment import Report
     from machine import MachineState
-    from offload_page import PAPER, page_of
+    from offload_page import PAPER, figures_of
 
     pages = ROOT / "docs" / "experiments"
     document = json.loads((pages / "offload.json").read_text(encoding="utf-8"))
-    shipped = Computed("offload", "", document, page_of(document), lambda: None, lambda *_: None)
+    shipped = Report("offload", document, {}, lambda *_: None, figures_of(document))
     assert set(document["tasks"]) == set(PAPER)
     assert (pages / "offload.md").read_text(encoding="utf-8") == shipped.to_page(MachineState(**document["machine"]))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import table1
 from experiment import OUTPUT
+from machine import machine_state
 
 from gdp.errors import LocalError
 
@@ -27,7 +28,7 @@ def test_a_region_without_prices_is_refused() -> None:
 
 def test_the_page_of_table_one_is_of_the_shipped_prices() -> None:
     shown = (OUTPUT / "table1.md").read_text()
-    assert shown.startswith(table1.page("us-east-1", table1.bills("us-east-1"), table1.applications()))
+    assert shown.startswith(table1.report("us-east-1").to_text(machine_state()))
 
 
 def test_every_application_of_the_paper_has_its_three_prices_next_to_ours() -> None:

@@ -1,4 +1,4 @@
-"""Node interface that the roles of a live ring need, for either ROS, and the orders that they take by signals. I/O."""
+"""What the nodes of a live ring need in either ROS: types, orders by signals, and lines of JSON. I/O."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import json
 import os
 import signal
 import time
-from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
-from typing import Final, NoReturn, Protocol
+from typing import Final, NoReturn
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,39 +22,7 @@ class Call:
     size: int
 
 
-class Caller(Protocol):
-    """A client of a lamp."""
-
-    def wait(self, seconds: float) -> bool:
-        """Return whether the service is available within this many seconds."""
-
-    def call(self, *, on: bool, patience_s: float) -> Call | None:
-        """Call the lamp; return the reply, None if none came within ``patience_s`` seconds."""
-
-
 Lamp = Callable[[bool], tuple[bool, str]]  # on -> success, message
-
-
-class Node(Protocol):
-    """A running node: its callbacks come from threads of its own."""
-
-    def publisher(self, topic: str, type_name: str, *, latched: bool) -> Callable[[object], None]:
-        """Create a publisher of a topic; return what publishes a message."""
-
-    def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
-        """Subscribe to a topic."""
-
-    def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
-        """Create a ``SetBool`` server."""
-
-    def caller(self, name: str, type_name: str) -> Caller:
-        """Create a ``SetBool`` client."""
-
-    def fit(self, values: array[int]) -> object:
-        """Return an array in the form of this ROS's messages."""
-
-    def size(self, message: object) -> int:
-        """Return the bytes of a message in this ROS's wire form."""
 
 
 def load_type(type_name: str) -> Callable[..., object]:

@@ -7,11 +7,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Final, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias
 
 from proxy.bridge.core.topic_stats import percentile
 from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, Mark, Talk, digest, lamp_says
-from ring.nodes.node import Call, Node, Order, Orders, load_type, say
+from ring.nodes.node import Call, Order, Orders, load_type, say
+
+if TYPE_CHECKING:
+    from ring.nodes.ros1 import Ros1Node
+    from ring.nodes.ros2 import Ros2Node
+
+Node: TypeAlias = "Ros1Node | Ros2Node"
 
 _GREETING_S: Final = 0.2
 _LOOK_S: Final = 0.25
@@ -73,18 +79,27 @@ def talk(node: Node, orders: Orders, of: Talk, count: int) -> NoReturn:
         publish(count)
 
 
-class Gap:
-    """The longest interval in a series of times."""
+class _Arrivals:
+    """Latencies of messages or answers, and the longest time between two of them."""
 
     def __init__(self) -> None:
+        self.latencies_ms: list[float] = []
         self._newest_ns: int | None = None
-        self.longest_ms: float | None = None
+        self._silent_ms: float | None = None
 
-    def note(self, now_ns: int) -> None:
-        """Add a time, in nanoseconds."""
+    def note(self, now_ns: int, latency_ms: float | None) -> None:
+        """Add one; ``latency_ms``: None: it is not timed."""
         if self._newest_ns is not None:
-            self.longest_ms = max(self.longest_ms or 0.0, (now_ns - self._newest_ns) / 1e6)
+            self._silent_ms = max(self._silent_ms or 0.0, (now_ns - self._newest_ns) / 1e6)
         self._newest_ns = now_ns
+        if latency_ms is not None:
+            self.latencies_ms.append(latency_ms)
+
+    def report(self) -> dict[str, object]:
+        """Return its part of a report."""
+        ordered = sorted(self.latencies_ms)
+        latency = {name: percentile(ordered, at) for name, at in (("median", 0.5), ("p99", 0.99), ("max", 1))}
+        return {"latency_ms": latency, "silent_ms": self._silent_ms}
 
 
 class _Ear:
@@ -94,30 +109,22 @@ class _Ear:
         self._of = of
         self.is_awake = False
         self.heard: list[str] = []
-        self.latencies_ms: list[float] = []
-        self._gap = Gap()
+        self.arrivals = _Arrivals()
 
     def take(self, message: object) -> None:
         now_ns = time.time_ns()
         mark: Mark = self._of.read(message)
         if mark.number:
             self.heard.append(digest(message))
-            self._gap.note(now_ns)
-            if self.is_awake:
-                self.latencies_ms.append((now_ns - mark.stamp_ns) / 1e6)
+            self.arrivals.note(now_ns, (now_ns - mark.stamp_ns) / 1e6 if self.is_awake else None)
         self.is_awake = True
 
     def progress(self) -> dict[str, object]:
         return {"topic": self._of.topic, "received": len(self.heard)}
 
     def report(self) -> dict[str, object]:
-        return {
-            "topic": self._of.topic,
-            "type": self._of.type_name,
-            "heard": list(self.heard),
-            "latency_ms": _latency(list(self.latencies_ms)),
-            "silent_ms": self._gap.longest_ms,
-        }
+        what = {"topic": self._of.topic, "type": self._of.type_name}
+        return {**what, "heard": list(self.heard), **self.arrivals.report()}
 
 
 def listen(node: Node, orders: Orders, talks: Sequence[Talk]) -> NoReturn:
@@ -129,7 +136,7 @@ def listen(node: Node, orders: Orders, talks: Sequence[Talk]) -> NoReturn:
     _until(lambda: all(ear.is_awake for ear in ears), orders)
     say("hears")
     while orders.wait(_LOOK_S) is not Order.REPORT:
-        latest = [ear.latencies_ms[-1] for ear in ears if ear.latencies_ms]
+        latest = [ear.arrivals.latencies_ms[-1] for ear in ears if ear.arrivals.latencies_ms]
         mean = sum(latest) / len(latest) if latest else None
         say("progress", topics=[ear.progress() for ear in ears], latency_ms=mean)
     say("done", topics=[ear.report() for ear in ears])
@@ -161,34 +168,26 @@ def call(node: Node, orders: Orders, count: int) -> NoReturn:
     orders.wait_for(Order.GO)
     pace = _Pace(LAMP_HZ, orders)
     size = right = newest = 0
-    latencies_ms = list[float]()
-    gap = Gap()
+    arrivals = _Arrivals()
     give_up_s = time.monotonic() + count / LAMP_HZ + _CALL_S
     for number in range(1, count + 1):
         pace.step()
         if time.monotonic() > give_up_s:
             break  # failing calls take long
-        say("progress", asked=number, answered=len(latencies_ms))
+        say("progress", asked=number, answered=len(arrivals.latencies_ms))
         on = bool(number % 2)
         began_ns = time.perf_counter_ns()
         answer = client.call(on=on, patience_s=_CALL_S)
         if answer is not None:
-            latencies_ms.append((time.perf_counter_ns() - began_ns) / 1e6)
-            gap.note(time.perf_counter_ns())
+            now_ns = time.perf_counter_ns()
+            arrivals.note(now_ns, (now_ns - began_ns) / 1e6)
             size += answer.size
             at = _switched(answer, on=on)
             right += at > newest
             newest = max(newest, at)
-    say("progress", asked=count, answered=len(latencies_ms))
-    say(
-        "done",
-        calls=count,
-        bytes=size,
-        answered=len(latencies_ms),
-        right=right,
-        latency_ms=_latency(latencies_ms),
-        silent_ms=gap.longest_ms,
-    )
+    answered = len(arrivals.latencies_ms)
+    say("progress", asked=count, answered=answered)
+    say("done", calls=count, bytes=size, answered=answered, right=right, **arrivals.report())
     orders.wait_for(Order.GO)
     while True:
         orders.wait(1 / LAMP_HZ)
@@ -206,8 +205,3 @@ def _switched(answer: Call, *, on: bool) -> int:
 def _until(is_so: Callable[[], bool], orders: Orders) -> None:
     while not is_so():
         orders.wait(_LOOK_S)
-
-
-def _latency(of: Sequence[float]) -> dict[str, float | None]:
-    ordered = sorted(of)
-    return {"median": percentile(ordered, 0.5), "p99": percentile(ordered, 0.99), "max": percentile(ordered, 1)}

@@ -1,4 +1,4 @@
-"""Node of ROS 1 for the roles of a live ring. I/O; imports rospy."""
+"""Node of ROS 1 for the roles of a live ring; ``ros2`` has the same methods. I/O; imports rospy."""
 
 from __future__ import annotations
 
@@ -9,17 +9,20 @@ from typing import Final
 
 import rospy
 
-from ring.nodes.node import Call, Caller, Lamp, load_type
+from ring.nodes.node import Call, Lamp, load_type
 
 _QUEUE: Final = 100
 
 
-class _Caller:
+class Caller:
+    """Client of a lamp."""
+
     def __init__(self, name: str, type_name: str) -> None:
         self._name = name
         self._call = rospy.ServiceProxy(name, load_type(type_name))
 
     def wait(self, seconds: float) -> bool:
+        """Return whether the service is available within this many seconds."""
         try:
             rospy.wait_for_service(self._name, timeout=seconds)
         except rospy.ROSException:
@@ -27,6 +30,7 @@ class _Caller:
         return True
 
     def call(self, *, on: bool, patience_s: float) -> Call | None:
+        """Call the lamp; return the reply, None if none came within ``patience_s`` seconds."""
         del patience_s  # rospy has no timeout; the server must answer or refuse
         try:
             response = self._call(on)
@@ -58,7 +62,7 @@ class Ros1Node:
 
     def caller(self, name: str, type_name: str) -> Caller:
         """Create a ``SetBool`` client."""
-        return _Caller(name, type_name)
+        return Caller(name, type_name)
 
     def fit(self, values: array[int]) -> object:
         """Return bytes for ``uint8[]``, a list for any other."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from array import array
 from collections.abc import Callable
-from typing import Final, Protocol, cast
+from typing import Any, Final
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -13,26 +13,25 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
-from ring.nodes.node import Call, Caller, Lamp, load_type
+from ring.nodes.node import Call, Lamp, load_type
 
 _DEPTH: Final = 50  # some seconds of pictures: Fast DDS may need three to request a lost sample
 
 
-class _SetBool(Protocol):
-    Request: Callable[..., object]
-    Response: Callable[..., object]
+class Caller:
+    """Client of a lamp."""
 
-
-class _Caller:
     def __init__(self, node: rclpy.node.Node, name: str, type_name: str) -> None:
-        self._kind = load_type(type_name)
-        self._request = cast("_SetBool", self._kind).Request
-        self._client = node.create_client(self._kind, name)
+        kind: Any = load_type(type_name)
+        self._request = kind.Request
+        self._client = node.create_client(kind, name)
 
     def wait(self, seconds: float) -> bool:
+        """Return whether the service is available within this many seconds."""
         return bool(self._client.wait_for_service(timeout_sec=seconds))
 
     def call(self, *, on: bool, patience_s: float) -> Call | None:
+        """Call the lamp; return the reply, None if none came within ``patience_s`` seconds."""
         request = self._request(data=on)
         came = threading.Event()
         future = self._client.call_async(request)
@@ -67,19 +66,17 @@ class Ros2Node:
 
     def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
         """Create a ``SetBool`` server."""
-        kind = load_type(type_name)
-        make = cast("_SetBool", kind).Response
+        kind: Any = load_type(type_name)
 
-        def answer(request: object, response: object) -> object:
-            del response
-            success, message = lamp(bool(getattr(request, "data", False)))
-            return make(success=success, message=message)
+        def answer(request: Any, response: Any) -> Any:
+            response.success, response.message = lamp(request.data)
+            return response
 
         self._node.create_service(kind, name, answer)
 
     def caller(self, name: str, type_name: str) -> Caller:
         """Create a ``SetBool`` client."""
-        return _Caller(self._node, name, type_name)
+        return Caller(self._node, name, type_name)
 
     def fit(self, values: array[int]) -> object:
         """Return the array itself."""

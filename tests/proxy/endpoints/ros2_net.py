@@ -32,6 +32,7 @@ from proxy.endpoints.ros2 import Ros2Endpoint
 DOMAIN = 100 + os.getpid() % 100
 NODE = proxy_node_name("0123456789abcdef" * 4)
 PATIENCE_S = 10.0
+PEER = Path(__file__).with_name("ros2_peer.py")
 _Found = TypeVar(
     "_Found", TypeResolved, MessageReceived, RequestReceived, ResponseReceived, CallFailed, EndpointError
 )  # the events of a handle
@@ -46,13 +47,23 @@ class Peer:
     Args:
         words: in front of the command, such as those of ``nsenter``.
         environment: in addition to that of this process.
+        program: reads the commands.
+        stderr: as of ``Popen``.
     """
 
-    def __init__(self, name: str, words: Sequence[str] = (), environment: Mapping[str, str] = CONFINED) -> None:
+    def __init__(
+        self,
+        name: str,
+        words: Sequence[str] = (),
+        environment: Mapping[str, str] = CONFINED,
+        program: Path = PEER,
+        stderr: int | None = None,
+    ) -> None:
         self._process = subprocess.Popen(
-            [*words, sys.executable, str(Path(__file__).with_name("ros2_peer.py")), name],
+            [*words, sys.executable, str(program), name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            stderr=stderr,
             text=True,
             env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), **environment},
         )

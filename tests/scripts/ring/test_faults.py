@@ -7,13 +7,13 @@ import pytest
 from gdp.errors import LocalError
 from lab.faults import Fault, FaultKind
 from lab.topology import ring5
-from ring.faults import check_faults, cut_from_text, kill_from_text, roam_from_text, roamers, text_of
+from ring.faults import check_faults, fault_from_text, roamers, text_of
 
 
 def fault(text: str) -> Fault:
     if text.startswith(("rib:", "switch:")):
-        return kill_from_text(text)
-    return roam_from_text(text) if ":" in text else cut_from_text(text)
+        return fault_from_text("kill", text)
+    return fault_from_text("roam", text) if ":" in text else fault_from_text("cut", text)
 
 
 def check(*texts: str, duration_s: float | None = None) -> None:
@@ -38,19 +38,19 @@ def test_a_fault_reads_as_it_is_written(text: str, read: Fault) -> None:
 @pytest.mark.parametrize("text", ["", "nuc2", "nuc2-nuc3", "nuc2@5", "nuc2-nuc3@", "nuc2-nuc3@-1", "nuc2-nuc3@soon"])
 def test_a_cut_written_otherwise_is_refused(text: str) -> None:
     with pytest.raises(LocalError, match="a cut is written like nuc2-nuc3@5"):
-        cut_from_text(text)
+        fault_from_text("cut", text)
 
 
 @pytest.mark.parametrize("text", ["", "nuc3@5", "proxy:nuc3@5", "rib:@5", "switch:nuc3", "switch:nuc3@-5"])
 def test_a_kill_written_otherwise_is_refused(text: str) -> None:
     with pytest.raises(LocalError, match="a kill is written like rib:school@8"):
-        kill_from_text(text)
+        fault_from_text("kill", text)
 
 
 @pytest.mark.parametrize("text", ["", "robot@5", "robot:nuc3", "robot:nuc3@5-9"])
 def test_roaming_written_otherwise_is_refused(text: str) -> None:
     with pytest.raises(LocalError, match="roaming is written like robot:nuc3@10"):
-        roam_from_text(text)
+        fault_from_text("roam", text)
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,8 @@ def result(heard: list[str] = SENT, served: int = 3, **caller: object) -> Result
 def test_a_live_run_passes_when_all_was_heard_and_answered() -> None:
     topic, lamp = result().topics
     assert result().passed
-    assert (topic.journey.median_ms, topic.journey.hops) == (3.0, 5)
-    assert (lamp.comparison.messages, lamp.comparison.delivered, lamp.journey.max_ms) == (3, 3, 9.5)
+    assert (topic.journey.latency_ms["median"], topic.journey.hops) == (3.0, 5)
+    assert (lamp.comparison.messages, lamp.comparison.delivered, lamp.journey.latency_ms["max"]) == (3, 3, 9.5)
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ from gdp.host.run_registry import Run, RunRegistry
 from lab.process import FailedError, LabProcess
 from lab.supervisor import Supervisor
 from ring import live_run
-from ring.live_run import LiveNodes, LiveSession
-from ring.progress import ProgressReporter
+from ring.live_run import LiveSession
 from ring.result import Heard
+from ring.traffic import ProgressReporter
 
 HEAD = """
 import json, signal, sys
@@ -47,12 +47,12 @@ def play(run: Run, talker: str = TALKER, lamp: str = LAMP, listener: str = LISTE
     supervisor = Supervisor()
     codes = {"talker": talker, "lamp": lamp, "listener": listener, "caller": caller}
     with ExitStack() as stack:
-        nodes = [
-            stack.enter_context(LabProcess(run, name, [sys.executable, "-c", code])) for name, code in codes.items()
-        ]
-        supervisor.ready(*nodes)
-        live_nodes = LiveNodes({nodes[0]: 2}, nodes[1], nodes[2], nodes[3], 1)
-        session = LiveSession(supervisor, live_nodes, ProgressReporter(Console(file=io.StringIO())))
+        nodes = {
+            name: stack.enter_context(LabProcess(run, name, [sys.executable, "-c", code]))
+            for name, code in codes.items()
+        }
+        supervisor.ready(*nodes.values())
+        session = LiveSession(supervisor, nodes, 2, 1, ProgressReporter(Console(file=io.StringIO())))
         session.meet()
         return session.talk(0.1)
 

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.errors import LocalError
 from ring.cli import spelled_out
-from ring.faults import cut_from_text, kill_from_text, roam_from_text
+from ring.faults import fault_from_text
 from ring.options import Options
 
 
@@ -23,10 +23,10 @@ from ring.options import Options
         {"bag": Path("/nowhere/my.bag")},
         {"json": Path("/nowhere/result.json")},
         {"pcap": Path("/nowhere/seen.pcap")},
-        {"faults": (cut_from_text("nuc1-nuc3@1"),)},
-        {"live": "ros2", "faults": (cut_from_text("nuc1-nuc2@10"),)},
-        {"faults": (kill_from_text("switch:nuc1@1"),)},
-        {"faults": (roam_from_text("cat:nuc2@1"),)},
+        {"faults": (fault_from_text("cut", "nuc1-nuc3@1"),)},
+        {"live": "ros2", "faults": (fault_from_text("cut", "nuc1-nuc2@10"),)},
+        {"faults": (fault_from_text("kill", "switch:nuc1@1"),)},
+        {"faults": (fault_from_text("roam", "cat:nuc2@1"),)},
         {"seconds": 4.0, "rate": 2.0},
         {"seconds": 0.5},
         {"lease_s": 0.5},
@@ -43,7 +43,11 @@ def test_what_cannot_be_done_is_refused_before_anything_starts(options: dict[str
 
 
 def test_settings_are_what_json_can_write() -> None:
-    faults = (cut_from_text("nuc2-nuc3@5"), roam_from_text("robot:nuc2@6"), kill_from_text("rib:school@7-9"))
+    faults = (
+        fault_from_text("cut", "nuc2-nuc3@5"),
+        fault_from_text("roam", "robot:nuc2@6"),
+        fault_from_text("kill", "rib:school@7-9"),
+    )
     assert Options(faults=faults).settings() == {
         "recording": "demo",
         "rate": 1.0,

@@ -14,11 +14,11 @@ from gdp.host.run_registry import Run, RunRegistry
 from lab.process import Event, FailedError, LabProcess
 from lab.supervisor import Supervisor
 from ring import run as replay_module
-from ring.faults import cut_from_text, text_of
+from ring.faults import fault_from_text, text_of
 from ring.overlay import Injection
-from ring.progress import ProgressReporter
 from ring.result import Result
 from ring.run import Replay
+from ring.traffic import ProgressReporter
 
 HEAD = """
 import json, signal, sys
@@ -114,7 +114,7 @@ def test_a_process_that_does_not_answer_in_time_is_reported(run: Run) -> None:
 
 def test_faults_are_injected_at_their_seconds_and_those_that_come_too_late_are_complaints(run: Run) -> None:
     supervisor, injected = Supervisor(), list[str]()
-    cuts = [cut_from_text("a-b@0-0.05"), cut_from_text("a-c@60")]
+    cuts = [fault_from_text("cut", "a-b@0-0.05"), fault_from_text("cut", "a-c@60")]
     injection = Injection(supervisor, cuts, lambda fault, begins: injected.append(f"{text_of(fault)} {begins}"))
     supervisor.follow(lambda: len(injected) == 2, 10)
     assert injected == ["a-b@0-0.05 True", "a-b@0-0.05 False"]
