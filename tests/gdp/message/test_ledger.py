@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.message.ledger import Ledger
+from gdp.message.renumbering import Renumbering
 
 PERIOD_S = 0.01
 
@@ -32,3 +33,13 @@ def test_messages_without_a_time_are_counted_and_not_remembered() -> None:
     assert [ledger.next(), ledger.next(1.0), ledger.next()] == [8, 9, 10]
     assert ledger.messages == 3
     assert (ledger.first_since(1.0), ledger.first_since(1.1)) == (9, 11)
+
+
+def test_a_message_alone_is_found_by_its_new_number_and_a_bundle_by_none() -> None:
+    ledger = Ledger(0)
+    ledger.put(number=1, sequence=1, messages=1)
+    ledger.put(number=2, sequence=2, messages=3)
+    move = Renumbering(1, 2, 4)
+    ledger.move(move)
+    assert (ledger.number_of(1), ledger.number_of(2)) == (move.new_number(1), None)
+    assert ledger.is_bundle(move.new_number(2))
