@@ -190,7 +190,7 @@ class UnicastReceiver(WriterProxy):
             introduces=False,
         )
 
-    def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
+    def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float) -> None:
         """Process one DATA or HEARTBEAT frame of this writer; one that is refused is requested again."""
         if self._public.state is WriterProxyState.NEW and self.delivery.delivered_bytes >= PRIVATE_WAIT_BYTES:
             self._data.drops[DropReason.MEMORY_FULL] += 1

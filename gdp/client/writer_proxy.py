@@ -185,7 +185,7 @@ class WriterProxy:
         number, known = max(self.delivery.expected, before.number), max(delivery.known, delivery.sequence)
         return Ended(number, status, delivery.sequence, known)
 
-    def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
+    def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float) -> None:
         """Process one DATA, HEARTBEAT or PARITY frame of this publisher, which came ``waited_s`` before."""
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1

@@ -176,7 +176,7 @@ class Pipe:
         def arrive() -> None:
             header = decode(frame)
             assert header.kind in (Kind.DATA, Kind.HEARTBEAT, Kind.PARITY)
-            end.writer_proxy.receive(header, frame, self.now_s)
+            end.writer_proxy.receive(header, frame, self.now_s, 0.0)
             end.delivered += end.writer_proxy.delivery.poll()
 
         return arrive

@@ -204,7 +204,7 @@ def test_a_bundle_that_is_not_exact_is_counted_and_nothing_of_it_delivered(body:
     )
     for number, message, flags in ((1, body, Flag.RELIABLE | Flag.BUNDLE), (2, b"next", Flag.RELIABLE)):
         for frame in sealer.seal(number, int(flags), sequenced(number, message), 1_500):
-            end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+            end.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
     assert [each.message for each in end.writer_proxy.delivery.poll()] == [b"next"]
     drops = end.writer_proxy.drops
     assert drops[DropReason.MALFORMED] + drops[DropReason.TRUNCATED] == 1

@@ -36,7 +36,7 @@ def forge(
 
 def give(pipe: Pipe, end: End, frames: list[bytes]) -> None:
     for frame in frames:
-        end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+        end.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
 
 
 def notes_of(pipe: Pipe, label: bytes, reports: list[AckNack]) -> list[bytes]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gdp.client.send_options import SendOptions
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.frame.codec import Header, Kind, decode
-from gdp.limits import REPAIR_S, REPORT_DELAY_S
+from gdp.limits import REPAIR_S, REPORT_DELAY_S, REPORT_GAP_S
 from gdp.message.late_repairs import HOLD_S
 from tests.draws import draws
 from tests.gdp.client.pipe import End, Pipe, publisher_of
@@ -202,6 +202,18 @@ def test_more_gaps_than_a_report_names_are_repaired_in_one_round_trip_and_a_few_
     assert pipe.publisher.protection.repairs == 150
 
 
+def test_each_gap_of_a_message_that_is_coming_is_requested_at_once_though_others_were_just_before() -> None:
+    pipe, end = joined()
+    pipe.batch_bytes, pipe.pause_s = 9_000, 0.01  # six fragments
+    lose(pipe, end, (1, 3), (1, 8), (1, 14))
+    pipe.publish([body(0, IMAGE_BYTES)])
+    pipe.run(ONE_WAY_S - 0.001)
+    for count in (1, 2, 3):
+        pipe.run(REPORT_GAP_S + 0.002)
+        assert requests(pipe) == count
+        pipe.run(0.01 - REPORT_GAP_S - 0.002)
+
+
 def test_no_fragment_is_sent_twice_in_a_round_trip_however_many_readers_lack_it() -> None:
     pipe, first = joined()
     second = pipe.join(b"b")
@@ -240,7 +252,7 @@ def test_replayed_frames_start_no_request_and_no_wait() -> None:
     old = [frame for frame in pipe.seen if decode(frame).kind == Kind.DATA]
     before = requests(pipe)
     for frame in old:
-        end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+        end.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
     pipe.run(0.5)
     assert requests(pipe) == before > 0
     assert pipe.publisher.protection.repairs == 5

@@ -44,7 +44,7 @@ def test_parity_forged_by_another_reader_delivers_nothing_wrong_and_holds_up_no_
         for index in range(8):
             wire = Parity(0, index, 8, rng.randbytes(size)).to_wire()
             frame = sealer.seal(number, index, 30, int(Flag.PARITY), wire)
-            end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+            end.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
 
     for _ in range(40):
         sent.append(rng.randbytes(SIZE))
@@ -70,7 +70,7 @@ def test_a_replay_of_all_frames_delivers_nothing_again_and_holds_no_memory() -> 
     old = [frame for frame in pipe.seen if decode(frame).kind in (Kind.DATA, Kind.PARITY)]
     unused = end.writer_proxy.drops[DropReason.UNUSED_PARITY]
     for frame in old:
-        end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+        end.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
     pipe.run(2.0)
     assert (len(end.delivered), end.writer_proxy.recovery.recovered) == (delivered, recovered)
     assert end.writer_proxy.drops[DropReason.UNUSED_PARITY] > unused
@@ -84,6 +84,6 @@ def test_strangers_parity_is_dropped_with_its_reason() -> None:
     seal = partial(sealer.seal, 1 << 20, 0, 30, int(Flag.PARITY))
     for body, epoch in ((bytes(100), 1), (bytes(OVERHEAD_BYTES), 1), (bytes(100), 9)):
         frame = seal(body)
-        end.writer_proxy.receive(decode(frame)._replace(epoch=epoch), frame, pipe.now_s)
+        end.writer_proxy.receive(decode(frame)._replace(epoch=epoch), frame, pipe.now_s, 0.0)
     drops = end.writer_proxy.drops
     assert (drops[DropReason.BAD_TAG], drops[DropReason.UNKNOWN_EPOCH]) == (2, 1)

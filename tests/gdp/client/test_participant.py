@@ -9,7 +9,7 @@ import pytest
 from gdp.client.participant import Participant
 from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import Kind
+from gdp.frame.codec import Flag, Header, Kind, encode
 from gdp.sansio import ReceivedFrame
 from gdp.trust.right import Right
 from lab.simulation import Simulation
@@ -247,3 +247,13 @@ def test_hundreds_of_appearances_and_disappearances_leave_nothing_behind() -> No
     assert max(now - before for now, before in zip(sizes(world), tables, strict=True)) <= 2
     assert count_objects() - objects < ROUNDS // 2  # a RIB keeps each validity that it saw for ten minutes
     assert flow.publisher.readers == 0
+
+
+def test_each_frame_of_an_unknown_kind_is_dropped_and_counted_once() -> None:
+    world = ring()
+    member = world.members[ROBOT]
+    switch = member.attachment.switch
+    assert switch is not None
+    frame = encode(Header(0x7F, Flag.NONE, 64, 1, 0, 1, 0, 1, 1, switch.name, member.name))
+    member.receive(2 * [ReceivedFrame(switch.port, switch.mac, frame)], world.network.now)
+    assert member.drops()[DropReason.UNKNOWN_KIND] == 2

@@ -213,7 +213,7 @@ def test_a_publisher_that_starts_again_is_another_incarnation() -> None:
     pipe.publish([b"second life"])
     pipe.run(1.0)
     frame = next(frame for frame in reversed(pipe.seen) if decode(frame).kind == Kind.DATA)
-    old.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+    old.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
     assert old.messages == [b"first life"]
     assert old.writer_proxy.drops[DropReason.WRONG_INCARNATION] == 1
     assert new.messages == [b"second life"]
@@ -236,7 +236,7 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
         random_bytes=urandom,
     )
     (frame,) = list(sealer.seal(2, Flag.RELIABLE, sequenced(2, b"new key"), 1500))
-    end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+    end.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
     assert [each.message for each in end.writer_proxy.delivery.poll()] == [b"new key"]
     sealer = Sealer(
         secret=b"3" * 32,
@@ -246,7 +246,7 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
         random_bytes=urandom,
     )
     (frame,) = list(sealer.seal(3, Flag.RELIABLE, sequenced(3, b"strange key"), 1500))
-    end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
+    end.writer_proxy.receive(decode(frame), frame, pipe.now_s, 0.0)
     assert end.writer_proxy.drops[DropReason.UNKNOWN_EPOCH] == 1
 
 

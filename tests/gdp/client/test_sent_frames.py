@@ -6,9 +6,11 @@ import pytest
 
 from gdp.client.reader_path import ReaderPaths
 from gdp.client.sent_frames import SentFrames
+from gdp.client.writer_proxy import WriterProxyState
 from gdp.congestion.controller import PathController
-from gdp.frame.codec import Header, Kind, encode
+from gdp.frame.codec import Header, Kind, decode, encode
 from gdp.message.acknack import AckNack, AckNackFlag
+from tests.gdp.client.pipe import Pipe, publisher_of
 
 READER = bytes(32)
 
@@ -151,3 +153,19 @@ def test_a_repair_to_several_readers_leaves_the_places_of_later_frames_known() -
         under_way.handle_report(name, shown(2, 2), 0.15)
     under_way.handle_report(READER, shown(3, 3), 0.15)
     assert controller.rate.inflight == 0
+
+
+def test_a_report_that_comes_before_the_next_poll_confirms_the_frames_that_left_last() -> None:
+    pipe = Pipe(publisher_of())
+    end = pipe.join(b"a")
+    assert pipe.run(2.0, lambda: end.writer_proxy.state is WriterProxyState.LIVE)
+    pipe.run(1.0)
+    pipe.publisher.publish(bytes(5_000))
+    for sent in pipe.publisher.poll_frames(pipe.now_s):
+        end.writer_proxy.receive(decode(sent), sent, pipe.now_s, 0.0)
+    reports = end.writer_proxy.control_to_send(pipe.now_s + 0.1)
+    assert reports
+    pipe.now_s += 0.1
+    pipe.tell(*reports)
+    pipe.publisher.sent_frames.count()
+    assert not pipe.publisher.sent_frames.is_unconfirmed

@@ -22,7 +22,7 @@ MTU = 300  # a fragment carries 188 bytes
 
 
 def seal(
-    number: int, message: bytes, *, signer: Signer = WRITER, mtu: int = MTU, secret: bytes = SECRET
+    number: int, message: bytes, *, signer: Signer = WRITER, mtu: int = MTU, secret: bytes = SECRET, flags: int = 0
 ) -> list[bytes]:
     return list(
         Sealer(
@@ -31,7 +31,7 @@ def seal(
             context=KeyContext(Kind.DATA, SOURCE, INCARNATION, TOPIC),
             signer=signer,
             random_bytes=urandom,
-        ).seal(number, 0, message, mtu)
+        ).seal(number, flags, message, mtu)
     )
 
 

@@ -53,6 +53,22 @@ def test_a_part_that_comes_twice_is_dropped() -> None:
     assert to.drops == {DropReason.DUPLICATE: 1}
 
 
+@pytest.mark.parametrize(
+    ("parts", "flags", "is_copy"),
+    [(1, Flag.URGENT, True), (2, Flag.URGENT, True), (3, Flag.URGENT, False), (1, 0, False), (2, 0, False)],
+)
+def test_urgent_messages_of_up_to_two_parts_have_copies_and_others_do_not(
+    parts: int, flags: int, is_copy: bool
+) -> None:
+    to, frames = reassembler(), seal(1, bytes(188 * (parts - 1)), flags=flags)
+    assert len(frames) == parts
+    for frame in frames:
+        add(to, frame)
+        add(to, frame, 0.004)
+    assert to.drops[DropReason.SECOND_COPY] == (parts if is_copy else 0)
+    assert to.drops.total() == parts
+
+
 @pytest.mark.parametrize("parts", [0, (1 << 17) + 1, 0xFFFF_FFFF])
 def test_an_impossible_count_of_parts_is_refused_before_the_reassembler(parts: int) -> None:
     header = Header(Kind.DATA, 0, HOPS_MAX, 1, TAG_BYTES, 1, 0, parts, INCARNATION, TOPIC, SOURCE)

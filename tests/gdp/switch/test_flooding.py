@@ -130,3 +130,17 @@ def test_a_port_with_several_switches_shows_what_all_of_them_should_have() -> No
     assert link_states.digest_for(port) == link_states.digest(inside.domain) != bytes(DIGEST_BYTES)
     port.neighbours[ZERO] = replace(inside, name=ZERO, domain=ZERO)
     assert link_states.digest_for(port) == bytes(DIGEST_BYTES)
+
+
+def test_a_switch_that_restarts_is_the_last_choice_until_its_trees_are_set_up() -> None:
+    world = ring()
+    world.network.run(1)
+
+    def costs() -> list[int]:
+        states = world.switches["nuc3"]._flooding.link_states.states(Scope.BORDER)
+        return [link.cost for each in states if each.origin == world.identities["nuc1"].name for link in each.links]
+
+    before = costs()
+    world.restart_switch("nuc1")
+    assert world.network.run(1.5, lambda: bool(costs()) and min(costs()) >= 1 << 20)
+    assert world.network.run(3.0, lambda: costs() == before)

@@ -30,6 +30,19 @@ def test_a_cleared_fault_is_reported_again(caplog: pytest.LogCaptureFixture) -> 
     assert caplog.messages == ["/chatter: qos: first", "/chatter: qos: again"]
 
 
+def test_a_fault_that_recurs_is_reported_at_each_power_of_ten_from_a_thousand_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    faults = Faults()
+    for _ in range(20_000):
+        faults.report("/chatter", Fault.TOO_LARGE, "each")
+    assert caplog.messages == [
+        "/chatter: too-large: each",
+        "/chatter: too-large: 1000 times by now",
+        "/chatter: too-large: 10000 times by now",
+    ]
+
+
 def test_every_fault_has_a_count_from_the_beginning() -> None:
     assert Faults().counts == {fault.value: 0 for fault in Fault}
 

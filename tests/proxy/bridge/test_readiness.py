@@ -73,6 +73,19 @@ def test_a_topic_that_ticks_makes_ready_and_its_silence_does_not(sites: Sites) -
     assert server.bridge.unready == [("/switch", "/beat is silent")]
 
 
+def test_a_reload_that_changes_a_probe_ends_the_one_before(sites: Sites) -> None:
+    server, client = pair(sites, f"service: /ready, {PROBE}")
+    probes = [LocalServer(server.graph, name, TRIGGER, answer=lambda _: YES) for name in ("/ready", "/ready2")]
+    assert sites.run(2, client.sees_server)
+    handles = server.endpoint.handles
+    sites.reload(server, expose=[f"{SWITCH}, readiness: {{service: /ready2, {PROBE}}}"])
+    sites.run(1)
+    before = probes[0].asked
+    assert sites.run(2, lambda: probes[1].asked >= 3)
+    assert client.sees_server()
+    assert (probes[0].asked, server.endpoint.handles) == (before, handles)
+
+
 def test_thresholds_count_results_in_a_row() -> None:
     ready = Thresholds(failures=2, successes=3)
     results = [True, True, False, True, True, True, False, True, False, False]

@@ -9,6 +9,7 @@ import pytest
 from gdp.intervals import READER
 from gdp.names import Name
 from lab.network import SimLink
+from proxy.bridge.exposed_service import ExposedService
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
@@ -323,3 +324,11 @@ def test_calls_under_way_fail_when_the_clients_proxy_drops_the_rule(sites: Sites
     sites.reload(client)
     assert sites.run(1, lambda: caller.outcomes == ["the proxy no longer carries this service"])
     assert not caller.sees_server()
+
+
+def test_a_message_for_a_client_that_is_not_connected_is_counted_as_unread_once(sites: Sites) -> None:
+    server, _, _, _ = pair(sites)
+    ((_, flow),) = server.bridge.flows
+    assert isinstance(flow, ExposedService)
+    flow._responses.send_wire(Name(b"g" * 32), b"an answer")
+    assert (server.context.traffic.unread, server.context.traffic.messages_out) == (1, 0)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from gdp.client.send_options import SendOptions
+from proxy.bridge.flow_rows import flow_rows
 from proxy.serial.channel import RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
@@ -199,3 +200,17 @@ def test_a_large_request_and_a_large_answer_arrive_whole(sites: Sites) -> None:
     assert sites.run(3, caller.sees_server)
     caller.call(known.string("x" * 500_000))
     assert sites.run(3, lambda: caller.outcomes == [known.string("x" * 500_000)])
+
+
+def test_rows_of_both_sides_count_requests_and_their_bytes(sites: Sites) -> None:
+    server, client = pair(sites)
+    LocalServer(server.graph, answer=lambda _: switched("yes"))
+    caller = Client(client.graph)
+    assert sites.run(3, caller.sees_server)
+    for _ in range(3):
+        caller.call(switch(on=True))
+    assert sites.run(1, lambda: caller.outcomes == 3 * [switched("yes")])
+    (out,), (into,) = (list(flow_rows(each.bridge.flows, (), each.member)) for each in (server, client))
+    assert (out.messages, into.messages) == (3, 3)
+    assert into.bytes == 3 * len(switch(on=True))
+    assert out.bytes == server.context.traffic.bytes_in > 0
