@@ -115,12 +115,7 @@ class Site:
 
     def stand_up(self) -> LabProcess:
         """Start switches, RIBs and the holder; return the holder."""
-        for node in TOPOLOGY.nodes:
-            self.credentials.switch(node, "auto")
-        self.nodes.start_all("switch", TOPOLOGY.nodes)
-        for at in TOPOLOGY.attached("rib"):
-            self.credentials.rib(at)
-        self.nodes.start_all("rib", [at.switch for at in TOPOLOGY.attached("rib")])
+        self.nodes.stand_up(TOPOLOGY.nodes, "auto")
         argv = [*GDP, "store", "serve", str(self.holder), "--store", str(self.store), "--json"]
         holder = self.lab.machines["nuc3"].launch(argv, "holder")
         holder.read(READY_S)
