@@ -16,6 +16,7 @@ from gdp.names import ZERO, Name
 
 BATCH_BYTES: Final = 512 << 10  # of records in one request or answer
 LISTED_MAX: Final = 1_024
+SYNCED_MAX: Final = 64  # capsules that one request finds different
 
 
 class Ask(str, Enum):
@@ -25,6 +26,7 @@ class Ask(str, Enum):
     APPEND = "append"  # records at an offset; a repetition changes nothing
     READ = "read"
     LIST = "list"
+    SYNC = "sync"  # ``data``: the total of what the client holds, or lines of it (``gdp/exchange/sync_set.py``)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,8 +61,8 @@ class HolderAnswer(FieldSet):
     Attributes:
         head: behind the last byte that is on its disk.
         offset: what is to be appended next; of records that were read, where they begin: as asked, or behind a gap.
-        data: records, or a part of the last one.
-        descriptors: of the listed capsules.
+        data: records, or a part of the last one; the holder's total.
+        descriptors: of the listed capsules, or of those that the client lacks in part.
     """
 
     MAX_BYTES = MESSAGE_MAX_BYTES

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -46,33 +47,95 @@ class _Waiting(NamedTuple):
     messages: int
 
 
-class KeptTopic:
-    """One topic that is kept.
+class _Upload:
+    """Upload of one topic's records to one holder.
 
     Attributes:
-        ring: on the disk here.
-        uploader: to the holder.
-        lost: messages that the disk here did not take in time.
+        holder: name of its service.
     """
 
-    def __init__(self, publisher: Publisher, ring: CapsuleRing, key: Identity, holder: Name) -> None:
-        self._publisher = publisher
-        self.ring = ring
+    def __init__(self, ring: CapsuleRing, holder: Name) -> None:
+        self._ring = ring
         self.holder = holder
-        self.name = ring.descriptor.name
-        self._writer = ChainWriter(ring.chain, key.key)
-        self.uploader = Uploader(self.name, ring.descriptor)
-        self._waiting = deque[_Waiting]()
-        self._waiting_bytes = 0
-        self.lost = self._reported = 0
-        self._reading: Future[tuple[int, bytes]] | None = None
+        self.uploader = Uploader(ring.descriptor.name, ring.descriptor)
+        self.reading: Future[tuple[int, bytes]] | None = None
         self._call: Call | None = None
-        publisher.record(self._record, self._describe)
 
     @property
     def is_busy(self) -> bool:
-        """Return whether something waits for the disk or the holder."""
-        return bool(self._waiting or self._reading or self._call)
+        """Return whether it waits for the disk or the holder."""
+        return bool(self.reading or self._call)
+
+    def receive(self, now_s: float, *, is_chosen: bool) -> None:
+        """Process the answer if there is one; ``is_chosen``: as for ``Uploader``."""
+        call, uploader = self._call, self.uploader
+        if call is not None and call.is_done:
+            self._call = None
+            if call.response is not None:
+                uploader.handle_response(call.response.payload, self._ring.end, now_s, is_chosen=is_chosen)
+            else:
+                uploader.handle_failure(str(call.error), now_s)
+
+    def send(self, client: ClientCore, now_s: float, *, is_chosen: bool) -> None:
+        """Send the next request if none is under way."""
+        reading, uploader, ring = self.reading, self.uploader, self._ring
+        if reading is not None and reading.done():
+            self.reading = None
+            try:
+                offset, data = reading.result()
+            except GdpError as error:
+                uploader.handle_failure(str(error), now_s)
+            else:
+                self._ask(uploader.append(offset, data), client, now_s)
+        wanted = uploader.next_step(ring.begin, ring.end, now_s, is_chosen=is_chosen)
+        if isinstance(wanted, HolderRequest):
+            self._ask(wanted, client, now_s)
+        elif wanted is not None:
+            self.reading = ring.read(wanted.offset, wanted.size)
+            if self.reading.done():
+                self.send(client, now_s, is_chosen=is_chosen)
+
+    def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
+        self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
+        client.begin(self._call, now_s)
+
+
+class KeptTopic:
+    """One topic that is kept.
+
+    The records go to the holder that has most, and the others fetch them from it: the uplink carries them once.
+
+    Attributes:
+        ring: on the disk here.
+        lost: messages that the disk here did not take in time.
+    """
+
+    def __init__(self, publisher: Publisher, ring: CapsuleRing, key: Identity, holders: Sequence[Name]) -> None:
+        self._publisher = publisher
+        self.ring = ring
+        self.name = ring.descriptor.name
+        self._writer = ChainWriter(ring.chain, key.key)
+        self._uploads = [_Upload(ring, holder) for holder in holders]
+        self._chosen = self._uploads[0]
+        self._waiting = deque[_Waiting]()
+        self._waiting_bytes = 0
+        self.lost = self._reported = 0
+        publisher.record(self._record, self._describe)
+
+    @property
+    def uploader(self) -> Uploader:
+        """Return that to the holder which gets the records."""
+        return self._chosen.uploader
+
+    @property
+    def confirmed(self) -> tuple[int, ...]:
+        """Return how many bytes each holder has, as it confirmed."""
+        return tuple(each.uploader.confirmed for each in self._uploads)
+
+    @property
+    def is_busy(self) -> bool:
+        """Return whether something waits for the disk or a holder."""
+        return bool(self._waiting) or any(each.is_busy for each in self._uploads)
 
     def flush(self, time_ns: int) -> None:
         """Append what was sealed to the ring, with checkpoints where they are due."""
@@ -95,45 +158,33 @@ class KeptTopic:
         if pieces:
             self.ring.append(b"".join(pieces), begins_file=False)
 
-    def upload(self, client: ClientCore, now_s: float) -> None:
-        """Send the next request if none is under way."""
-        call, reading, uploader = self._call, self._reading, self.uploader
-        if call is not None and call.is_done:
-            self._call = None
-            if call.response is not None:
-                uploader.handle_response(call.response.payload, self.ring.end, now_s)
-            else:
-                uploader.handle_failure(str(call.error), now_s)
-        if reading is not None and reading.done():
-            self._reading = None
-            try:
-                offset, data = reading.result()
-            except GdpError as error:
-                uploader.handle_failure(str(error), now_s)
-            else:
-                self._ask(uploader.append(offset, data), client, now_s)
-        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s)
-        if isinstance(wanted, HolderRequest):
-            self._ask(wanted, client, now_s)
-        elif wanted is not None:
-            self._reading = self.ring.read(wanted.offset, wanted.size)
-            if self._reading.done():
-                self.upload(client, now_s)
+    def upload(self, clients: Mapping[Name, ClientCore], now_s: float) -> None:
+        """Send the next requests where none is under way."""
+        for each in self._uploads:
+            each.receive(now_s, is_chosen=each is self._chosen)
+        if not self._chosen.is_busy:
+            ready = [each for each in self._uploads if not each.uploader.is_refused] or self._uploads
+            self._chosen = max(ready, key=lambda each: (each.uploader.confirmed, each is self._chosen))
+        for each in self._uploads:
+            each.send(clients[each.holder], now_s, is_chosen=each is self._chosen)
 
     @property
     def is_reading(self) -> bool:
         """Return whether the disk is read for the next request."""
-        return self._reading is not None
+        return self._chosen.reading is not None
 
     @property
     def is_uploaded(self) -> bool:
-        """Return whether the holder has confirmed all that is here."""
-        return not self.is_busy and self.uploader.confirmed == self.ring.end
+        """Return whether every holder has confirmed all that is here."""
+        return not self.is_busy and min(self.confirmed) == self.ring.end
 
     def poll_faults(self) -> list[str]:
-        """Return, once, what went wrong: what the holder refused or never had, and messages that are not kept."""
-        faults, lost = self.uploader.poll_faults(), self.lost - self._reported
-        self._reported = self.lost
+        """Return, once, what went wrong: what a holder refused or never had, and messages that are not kept."""
+        faults = [each for upload in self._uploads for each in upload.uploader.poll_faults()]
+        if len(self._uploads) > 1:
+            have = sum(each >= max(self.confirmed) for each in self.confirmed)
+            faults = [f"{have} of {len(self._uploads)} holders have it: {each}" for each in faults]
+        lost, self._reported = self.lost - self._reported, self.lost
         why = self.ring.failure or "the disk is too slow"
         return [*faults, f"{lost} messages are not kept: {why}"] if lost else faults
 
@@ -142,10 +193,6 @@ class KeptTopic:
         self.flush(time_ns)
         if self._writer.has_new and self.ring.is_ready:
             self._append([self._writer.checkpoint(time_ns)])
-
-    def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
-        self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
-        client.begin(self._call, now_s)
 
     def _record(self, frames: Sealed, sequence: int, messages: int) -> None:
         if self._waiting_bytes + frames.size_bytes > WINDOW_BYTES:
@@ -185,11 +232,13 @@ class CapsuleKeeper:
         self.ended: dict[Name, KeptTopic] = {}
         self._due_s = 0.0
 
-    def keep(self, topic: Topic, publisher: Publisher, holder: Topic, most_bytes: int, unix_s: float) -> KeptTopic:
+    def keep(
+        self, topic: Topic, publisher: Publisher, holders: Sequence[Topic], most_bytes: int, unix_s: float
+    ) -> KeptTopic:
         """Keep what a publisher publishes from now on.
 
         Args:
-            holder: the delegation to call the holder's service.
+            holders: the delegations to call the holders' services, the preferred one first.
             most_bytes: of the ring.
 
         Raises:
@@ -200,10 +249,13 @@ class CapsuleKeeper:
             before.ring.close()
         descriptor = Descriptor(delegation.subject, self._identity.membership, delegation.chain, int(unix_s * 1e3))
         ring = CapsuleRing(self._folder / topic.name.to_text(), descriptor, most_bytes, self._pool)
-        if holder.name not in self._clients:
-            label = f"holder {holder.name.short}"
-            self._clients[holder.name] = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
-        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, holder.name)
+        for holder in holders:
+            if holder.name not in self._clients:
+                label = f"holder {holder.name.short}"
+                client = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
+                self._clients[holder.name] = client
+        names = [holder.name for holder in holders]
+        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, names)
         log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
         return kept
 
@@ -234,7 +286,7 @@ class CapsuleKeeper:
             if due_s is not None and now.mono_s >= due_s:
                 client.handle_timer(now.mono_s)
         for kept in (*self.topics.values(), *self.ended.values()):
-            kept.upload(self._clients[kept.holder], now.mono_s)
+            kept.upload(self._clients, now.mono_s)
             if kept.is_reading:
                 self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
         for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
@@ -248,7 +300,7 @@ class CapsuleKeeper:
     @property
     def confirmed(self) -> int:
         """Return how many bytes the holders have confirmed."""
-        return sum(each.uploader.confirmed for each in (*self.topics.values(), *self.ended.values()))
+        return sum(sum(each.confirmed) for each in (*self.topics.values(), *self.ended.values()))
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""

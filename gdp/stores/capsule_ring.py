@@ -13,7 +13,7 @@ from typing import Final
 
 from gdp.capsule.chain import Chain
 from gdp.capsule.descriptor import Descriptor
-from gdp.capsule.record import find, split
+from gdp.capsule.record import Record, RecordType, find, split
 from gdp.errors import GdpError, RemoteError, StoreError
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.segments import SEGMENT_BYTES, Segments
@@ -108,7 +108,7 @@ def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain,
             if (before.topic, before.writer) != (descriptor.topic, descriptor.writer):
                 continue
             segments = Segments(place)
-            chain = replayed(before, segments)
+            chain, _ = replayed(before, segments)
         except GdpError as error:
             log.warning("capsule cannot be continued, another begins path=%s reason=%s", place, error)
             continue
@@ -118,14 +118,20 @@ def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain,
     return descriptor, Chain(descriptor.name, descriptor.key), Segments(place)
 
 
-def replayed(descriptor: Descriptor, segments: Segments) -> Chain:
-    """Return the chain behind the last whole record; a torn write is cut. Raises ``RemoteError``: damage before it."""
+def replayed(descriptor: Descriptor, segments: Segments) -> tuple[Chain, dict[int, Record]]:
+    """Return the chain behind the last whole record, and the checkpoints of the last file by offset.
+
+    A torn write is cut. Raises ``RemoteError``: damage before it.
+    """
     while segments.offsets:
         chain, last, at = Chain(descriptor.name, descriptor.key), segments.last, 0
+        checkpoints = dict[int, Record]()
         data = segments.read(last, segments.size_of(last))[1]
         try:
             for wire in split(data):
-                chain.handle_record(wire, may_skip=True)
+                record = chain.handle_record(wire, may_skip=True)
+                if record.type is RecordType.CHECKPOINT:
+                    checkpoints[last + at] = record
                 at += len(wire)
         except RemoteError:
             if find(data, at) is not None:
@@ -133,6 +139,6 @@ def replayed(descriptor: Descriptor, segments: Segments) -> Chain:
         if at:
             if at < len(data):
                 segments.cut(last + at)
-            return chain
+            return chain, checkpoints
         segments.drop(last)
-    return Chain(descriptor.name, descriptor.key)
+    return Chain(descriptor.name, descriptor.key), {}

@@ -43,7 +43,7 @@ class TopicKeeper:
         """Keep what the publisher of a local name publishes; return why that is not possible, empty if it is."""
         self._local[topic.name] = local
         try:
-            self.capsules.keep(topic, publisher, self._holder(keep.to), keep.disk, unix_s)
+            self.capsules.keep(topic, publisher, [self._holder(each) for each in keep.to], keep.disk, unix_s)
         except GdpError as error:
             return str(error)
         return ""

@@ -9,17 +9,18 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timezone
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from gdp.capsule.holder import HolderAnswer, HolderRequest
 from gdp.cli.node import Config, Json, Logs, MemberPlane, failing_clearly
+from gdp.cli.store import ask
 from gdp.client.participant import Topic
 from gdp.errors import LocalError
-from gdp.session.session import Session, open_session
+from gdp.session.session import open_session
 from gdp.trust.right import Right
 from proxy.cli.tool_options import Node, print_json, print_text
 from proxy.endpoints.core.endpoint import Origin
@@ -83,7 +84,7 @@ def _export(
     """Write the recording, and report; return whether it has all."""
     with open_session(node) as session:
         histories = [
-            TopicHistory(lambda request: _ask(session, holder, request), topic, _name_of(topic, name), *span_ns)
+            TopicHistory(partial(ask, session, holder), topic, _name_of(topic, name), *span_ns)
             for name in names
             for topic in [session.core.resolve(name, Right.READ)]
         ]
@@ -122,10 +123,6 @@ def _write(output: Path, messages: Iterator[PastMessage]) -> int:
             origin = Origin(message.stamp_ns, message.sequence)
             writer.write(writer.add(message.channel), message.stamp_ns, message.raw, origin)
     return writer.written
-
-
-def _ask(session: Session, holder: str, request: HolderRequest) -> HolderAnswer:
-    return HolderAnswer.from_cbor(session.call(holder, request.to_cbor(), replication=1).payload)
 
 
 def _name_of(topic: Topic, name: str) -> str:

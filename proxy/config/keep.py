@@ -35,4 +35,11 @@ class Keep(Section):
         BeforeValidator(read_size),
         WithJsonSchema({"anyOf": [{"type": "integer", "minimum": DISK_MIN_BYTES}, {"type": "string"}]}),
     ] = Field(default=10**9, ge=DISK_MIN_BYTES, description="Most bytes that wait here, such as `2GB`.")
-    to: str = Field(min_length=1, description="The holder's service, as `gdp delegate` named it, or 64 hex digits.")
+    to: Annotated[
+        tuple[Annotated[str, Field(min_length=1)], ...],
+        BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
+        WithJsonSchema({"anyOf": [{"type": "string", "minLength": 1}, {"type": "array", "items": {"type": "string"}}]}),
+    ] = Field(
+        min_length=1,
+        description="The holder's service, as `gdp delegate` named it, or 64 hex digits; or a list: each holds all.",
+    )
