@@ -250,14 +250,25 @@ class CapsuleKeeper:
         descriptor = Descriptor(delegation.subject, self._identity.membership, delegation.chain, int(unix_s * 1e3))
         ring = CapsuleRing(self._folder / topic.name.to_text(), descriptor, most_bytes, self._pool)
         for holder in holders:
-            if holder.name not in self._clients:
-                label = f"holder {holder.name.short}"
-                client = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
-                self._clients[holder.name] = client
+            self._client(holder)
         names = [holder.name for holder in holders]
         kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, names)
         log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
         return kept
+
+    def ask(self, holder: Topic, request: HolderRequest, now_s: float) -> Call:
+        """Ask a holder; the call ends later. Raises ``LocalError``: no delegation."""
+        call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
+        self._client(holder).begin(call, now_s)
+        return call
+
+    def _client(self, holder: Topic) -> ClientCore:
+        client = self._clients.get(holder.name)
+        if client is None:
+            label = f"holder {holder.name.short}"
+            client = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
+            self._clients[holder.name] = client
+        return client
 
     def release(self, topic: Name, unix_s: float) -> None:
         """Keep a topic no more; what waits is uploaded. Its capsule is continued when it is kept again."""
@@ -304,9 +315,8 @@ class CapsuleKeeper:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        if not self.topics and not self.ended:
-            return None
-        return earliest(self._due_s, *[each.get_timer() for each in self._clients.values()])
+        due_s = self._due_s if self.topics or self.ended else None
+        return earliest(due_s, *[each.get_timer() for each in self._clients.values()])
 
     def close(self, unix_s: float) -> None:
         """Put everything on the disk."""

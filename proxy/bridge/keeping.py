@@ -6,19 +6,38 @@ I/O, by its rings.
 from __future__ import annotations
 
 import secrets
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
+from gdp.capsule.holder import HolderAnswer
+from gdp.capsule.late_join import LateJoin
 from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.crypto.identity import Identity
+from gdp.due_queue import earliest
 from gdp.errors import GdpError, LocalError
+from gdp.intervals import PACE_S
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.sansio import Timestamps
 from gdp.session.keeping import CapsuleKeeper
+from gdp.session.protocol.client_core import Call
 from gdp.trust.right import Right
 from proxy.bridge.faults import Fault, Faults
+from proxy.config.history import History
 from proxy.config.keep import Keep
+
+
+@dataclass(slots=True)
+class _Joining:
+    local: str
+    join: LateJoin
+    store: str
+    deliver: Callable[[float], None]
+    call: Call | None = None
+    due_s: float = 0.0
 
 
 class TopicKeeper:
@@ -37,6 +56,7 @@ class TopicKeeper:
         self._held = held
         self._local: dict[Name, str] = {}  # names of the topics that are kept
         self._failing: set[Name] = set()
+        self._joins: dict[Name, _Joining] = {}
         self.capsules = CapsuleKeeper(member, identity, folder, start=secrets.randbits(63))
 
     def keep(self, local: str, topic: Topic, publisher: Publisher, keep: Keep, unix_s: float) -> str:
@@ -47,6 +67,32 @@ class TopicKeeper:
         except GdpError as error:
             return str(error)
         return ""
+
+    def join(self, local: str, topic: Topic, history: History, deliver: Callable[[float], None]) -> LateJoin:
+        """Return a topic's past from a holder, for a reader that joins late; ``deliver`` is called when it has come."""
+        join = LateJoin(topic, time.time(), history.age_s, history.messages, history.max_bytes)
+        self._joins[topic.name] = _Joining(local, join, history.store or "", deliver)
+        return join
+
+    def leave(self, topic: Name) -> None:
+        """Read a topic's past no more."""
+        self._joins.pop(topic, None)
+
+    def _ask(self, joining: _Joining, now_s: float, faults: Faults) -> None:
+        """Ask a holder for the next part of a topic's past."""
+        join, call, joining.due_s = joining.join, joining.call, now_s + PACE_S
+        try:
+            if call is not None and call.is_done:
+                joining.call = None
+                if call.response is None:
+                    raise call.error or LocalError("no answer")
+                join.handle_response(HolderAnswer.from_cbor(call.response.payload), now_s)
+            if joining.call is None and (request := join.next_request(now_s)) is not None:
+                joining.call = self.capsules.ask(self._holder(joining.store), request, now_s)
+        except GdpError as error:
+            join.give_up()
+            faults.report(joining.local, Fault.NOT_KEPT, f"no past from {joining.store}: {error}")
+        joining.deliver(now_s)
 
     def release(self, topic: Name, unix_s: float) -> None:
         """Keep a topic no more."""
@@ -59,6 +105,8 @@ class TopicKeeper:
     def handle(self, now: Timestamps, faults: Faults) -> None:
         """Write and upload what is there, and report what is not kept or not taken by its holder."""
         self.capsules.handle(now)
+        for joining in self._joins.values():
+            self._ask(joining, now.mono_s, faults)
         for name, kept in (*self.capsules.topics.items(), *self.capsules.ended.items()):
             for detail in kept.poll_faults():
                 self._failing.add(name)
@@ -69,7 +117,7 @@ class TopicKeeper:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return self.capsules.get_timer()
+        return earliest(self.capsules.get_timer(), *[each.due_s for each in self._joins.values()])
 
     def renew(self, held: DelegationStore) -> None:
         """Replace the delegations: new epochs of the holders' services take effect."""

@@ -1,4 +1,4 @@
-"""Holders of capsules that lie, fork, withhold or roll back; a writer whose key has leaked; members that fill a disk."""
+"""Holders of capsules that lie, withhold or roll back; a writer whose key has leaked; members that fill a disk."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def test_what_is_not_kept_is_a_fault_until_the_holder_has_all(tmp_path: Path) ->
     )
     topic: Any = SimpleNamespace(name=Name(b"t" * 32))
     publisher: Any = None
-    assert "0 delegations to call store" in keeper.keep("/scan", topic, publisher, Keep(to="store"), 1.0)
+    assert "0 delegations to call store" in keeper.keep("/scan", topic, publisher, Keep(to=("store",)), 1.0)
     capsules = SimpleNamespace(topics={topic.name: kept}, ended={}, handle=lambda _now: None)
     keeper.capsules = cast("CapsuleKeeper", capsules)
     kept.new, kept.uploader.is_refused = ["the quota is full"], True
