@@ -89,16 +89,6 @@ class StoredCapsule:
         """Return the offset that is expected next."""
         return self.segments.end + len(self.rest)
 
-    def resume(self) -> dict[int, Record]:
-        """Read the last segment, so that records can be appended; return its checkpoints by offset.
-
-        Raises:
-            RemoteError: it is damaged.
-        """
-        self.chain, checkpoints = replayed(self.descriptor, self.segments)
-        self.damage = ""
-        return checkpoints
-
     def audit(self, *, known: bytes | None = None, is_deep: bool = False) -> Audit:
         """Return the finished audit of all segments."""
         audit, end = Audit(self.name, self.descriptor.key, known=known, is_deep=is_deep), None
@@ -204,7 +194,7 @@ class CapsuleStore(ClosedOnExit):
         with self._lock:
             before = capsule.segments.end
             self._add(capsule, offset, data)
-            return capsule.segments.end != before
+        return capsule.segments.end != before
 
     def replace(self, capsule: StoredCapsule, offset: int, data: bytes) -> bool:
         """Replace the beginning of a segment by proven records of another holder; return whether that changed it.
@@ -250,6 +240,8 @@ class CapsuleStore(ClosedOnExit):
         if self._faults.get(name) != fault:
             self._faults[name] = fault
             self._new_faults[name] = fault
+            if len(self._faults) > LISTED_MAX:
+                del self._faults[next(iter(self._faults))]
             log.error("capsule fault name=%s reason=%s", name.short, fault)
 
     def poll_faults(self) -> dict[Name, str]:
@@ -394,7 +386,8 @@ class CapsuleStore(ClosedOnExit):
         segments = capsule.segments
         with self._index.reading() as index:
             (last,) = index.execute("SELECT max(offset) FROM checkpoints WHERE capsule = ?", (capsule.name,)).fetchone()
-        found = capsule.resume()
+        capsule.chain, found = replayed(capsule.descriptor, segments)
+        capsule.damage = ""
         for offset in segments.offsets[:-1]:
             size = segments.size_of(offset)
             if last is not None and offset + size <= last:

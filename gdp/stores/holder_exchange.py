@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from contextlib import suppress
+from itertools import accumulate
 from typing import TypeAlias
 
 from gdp.capsule.chain import Chain
@@ -59,7 +60,9 @@ def _fetch(store: CapsuleStore, capsule: StoredCapsule, holder: str) -> Generato
         known = store.checkpoints(capsule) or [0]
         at = known[min(back, len(known) - 1)]
         begin, data = yield from _proven(capsule, at)
-        other = next((each for each in _placed(begin, data) if not capsule.segments.has(*each)), None)
+        wires = list(split(data))
+        placed = zip(accumulate(map(len, wires), initial=begin), wires, strict=False)
+        other = next((each for each in placed if not capsule.segments.has(*each)), None)
         if data and other is None:
             if not store.add(capsule, begin, data):
                 return has_come or store.checkpoints(capsule) not in ([], known)
@@ -112,12 +115,3 @@ def _proven(
         except RemoteError:
             break
     return begin, data[:proven]
-
-
-def _placed(begin: int, data: bytes) -> list[tuple[int, bytes]]:
-    """Return records with their offsets."""
-    placed = []
-    for wire in split(data):
-        placed.append((begin, wire))
-        begin += len(wire)
-    return placed

@@ -35,7 +35,7 @@ def _history(value: object) -> object:
 def _or_count(schema: JsonDict) -> None:
     forms = schema.get("anyOf")
     if isinstance(forms, list):
-        count = {"type": "integer", "minimum": 1, "maximum": HISTORY_MESSAGES_MAX}
+        count: JsonDict = {"type": "integer", "minimum": 1, "maximum": HISTORY_MESSAGES_MAX}
         schema["anyOf"] = [count, {"const": "from-store"}, *forms]
 
 

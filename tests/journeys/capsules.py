@@ -166,6 +166,7 @@ class Keeping:
     holders: tuple[str, ...] = (STORE,)
     keeper: CapsuleKeeper = field(init=False)
     kept: KeptTopic = field(init=False)
+    step_s: float = _STEP_S
     worked_s: float = 0.0
 
     def __post_init__(self) -> None:
@@ -192,7 +193,7 @@ class Keeping:
 
         def step() -> bool:
             now_s = world.network.now.mono_s
-            if now_s - self.worked_s < _STEP_S:
+            if now_s - self.worked_s < self.step_s:
                 return False
             self.worked_s = now_s
             self.work()
