@@ -43,6 +43,7 @@ class Uploader:
         self._is_under_way = False
         self._retry_s = -NEVER_S
         self._failures = 0  # in a row
+        self._is_chosen = True
         self.confirmed = 0
         self.is_refused = False
         self._faults: list[str] = []
@@ -57,6 +58,7 @@ class Uploader:
         """
         if self._is_under_way or now_s < self._retry_s:
             return None
+        self._is_chosen = is_chosen
         if not is_chosen:
             if self.confirmed == end:
                 return None
@@ -77,7 +79,7 @@ class Uploader:
         descriptor = None if self.confirmed else self._descriptor
         return HolderRequest(ask=Ask.APPEND, capsule=self._name, offset=offset, data=data, descriptor=descriptor)
 
-    def handle_response(self, wire: bytes, end: int, now_s: float, *, is_chosen: bool = True) -> None:
+    def handle_response(self, wire: bytes, end: int, now_s: float) -> None:
         """Process an answer."""
         try:
             answer = HolderAnswer.from_cbor(wire)
@@ -93,7 +95,7 @@ class Uploader:
             self._head = None
             return
         self.confirmed, self._head = head, max(head, answer.offset)
-        if not is_chosen:
+        if not self._is_chosen:
             self._retry_s = now_s + POLL_S
 
     def handle_failure(self, reason: str, now_s: float) -> None:

@@ -66,18 +66,18 @@ class _Upload:
         """Return whether it waits for the disk or the holder."""
         return bool(self.reading or self._call)
 
-    def receive(self, now_s: float, *, is_chosen: bool) -> None:
-        """Process the answer if there is one; ``is_chosen``: as for ``Uploader``."""
+    def receive(self, now_s: float) -> None:
+        """Process the answer if there is one."""
         call, uploader = self._call, self.uploader
         if call is not None and call.is_done:
             self._call = None
             if call.response is not None:
-                uploader.handle_response(call.response.payload, self._ring.end, now_s, is_chosen=is_chosen)
+                uploader.handle_response(call.response.payload, self._ring.end, now_s)
             else:
                 uploader.handle_failure(str(call.error), now_s)
 
     def send(self, client: ClientCore, now_s: float, *, is_chosen: bool) -> None:
-        """Send the next request if none is under way."""
+        """Send the next request if none is under way; ``is_chosen``: as for ``Uploader``."""
         reading, uploader, ring = self.reading, self.uploader, self._ring
         if reading is not None and reading.done():
             self.reading = None
@@ -161,7 +161,7 @@ class KeptTopic:
     def upload(self, clients: Mapping[Name, ClientCore], now_s: float) -> None:
         """Send the next requests where none is under way."""
         for each in self._uploads:
-            each.receive(now_s, is_chosen=each is self._chosen)
+            each.receive(now_s)
         if not self._chosen.is_busy:
             ready = [each for each in self._uploads if not each.uploader.is_refused] or self._uploads
             self._chosen = max(ready, key=lambda each: (each.uploader.confirmed, each is self._chosen))

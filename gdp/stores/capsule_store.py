@@ -221,8 +221,9 @@ class CapsuleStore(ClosedOnExit):
 
     def gaps(self, capsule: StoredCapsule) -> list[int]:
         """Return where the segments begin behind which bytes are missing; 0: before the first, and none are dropped."""
-        gaps, limits = capsule.segments.gaps, self._limits
-        return [0, *gaps] if capsule.segments.begin and limits.capsule_bytes is limits.age_s is None else gaps
+        segments, limits = capsule.segments, self._limits
+        gaps = [each for each, later in pairwise(segments.offsets) if each + segments.size_of(each) < later]
+        return [0, *gaps] if segments.begin and limits.capsule_bytes is limits.age_s is None else gaps
 
     @property
     def capsules(self) -> list[StoredCapsule]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import os
 from bisect import bisect_right
-from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -130,12 +129,6 @@ class Segments(ClosedOnExit):
                 return False
             at = begin + len(known)
         return True
-
-    @property
-    def gaps(self) -> list[int]:
-        """Return where the files begin behind which bytes are missing."""
-        sizes = list(self._sizes.items())
-        return [offset for (offset, size), (later, _) in pairwise(sizes) if offset + size < later]
 
     def replace(self, offset: int, data: bytes) -> None:
         """Replace or add the file that begins at an offset, whole or not at all.

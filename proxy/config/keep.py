@@ -27,6 +27,10 @@ def read_size(value: object) -> object:
     return int(found[1]) * _UNITS[found[2]]
 
 
+def _services(value: object) -> object:
+    return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
+
+
 class Keep(Section):
     """What is kept of a topic, and who holds it."""
 
@@ -37,7 +41,7 @@ class Keep(Section):
     ] = Field(default=10**9, ge=DISK_MIN_BYTES, description="Most bytes that wait here, such as `2GB`.")
     to: Annotated[
         tuple[Annotated[str, Field(min_length=1)], ...],
-        BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
+        BeforeValidator(_services),
         WithJsonSchema({"anyOf": [{"type": "string", "minLength": 1}, {"type": "array", "items": {"type": "string"}}]}),
     ] = Field(
         min_length=1,
