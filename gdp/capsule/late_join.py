@@ -92,7 +92,7 @@ class LateJoin:
         for writer in self._writers.values():
             writer.until_s, writer.is_read = -NEVER_S, True
 
-    def receive(self, message: Message, now_s: float) -> None:
+    def receive_live(self, message: Message, now_s: float) -> None:
         """Take in a live message."""
         publisher = message.delivered.publisher
         writer = self._writers.setdefault(publisher, _Writer(_FIRST_NS, is_read=self._is_listed))

@@ -66,7 +66,7 @@ class _Upload:
         """Return whether it waits for the disk or the holder."""
         return bool(self.reading or self._call)
 
-    def receive(self, now_s: float) -> None:
+    def handle_call(self, now_s: float) -> None:
         """Process the answer if there is one."""
         call, uploader = self._call, self.uploader
         if call is not None and call.is_done:
@@ -76,7 +76,7 @@ class _Upload:
             else:
                 uploader.handle_failure(str(call.error), now_s)
 
-    def send(self, client: ClientCore, now_s: float, *, is_chosen: bool) -> None:
+    def send_next(self, client: ClientCore, now_s: float, *, is_chosen: bool) -> None:
         """Send the next request if none is under way; ``is_chosen``: as for ``Uploader``."""
         reading, uploader, ring = self.reading, self.uploader, self._ring
         if reading is not None and reading.done():
@@ -93,7 +93,7 @@ class _Upload:
         elif wanted is not None:
             self.reading = ring.read(wanted.offset, wanted.size)
             if self.reading.done():
-                self.send(client, now_s, is_chosen=is_chosen)
+                self.send_next(client, now_s, is_chosen=is_chosen)
 
     def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
         self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
@@ -161,12 +161,12 @@ class KeptTopic:
     def upload(self, clients: Mapping[Name, ClientCore], now_s: float) -> None:
         """Send the next requests where none is under way."""
         for each in self._uploads:
-            each.receive(now_s)
+            each.handle_call(now_s)
         if not self._chosen.is_busy:
             ready = [each for each in self._uploads if not each.uploader.is_refused] or self._uploads
             self._chosen = max(ready, key=lambda each: (each.uploader.confirmed, each is self._chosen))
         for each in self._uploads:
-            each.send(clients[each.holder], now_s, is_chosen=each is self._chosen)
+            each.send_next(clients[each.holder], now_s, is_chosen=each is self._chosen)
 
     @property
     def is_reading(self) -> bool:

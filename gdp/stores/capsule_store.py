@@ -140,7 +140,7 @@ class CapsuleStore(ClosedOnExit):
             try:
                 self._resume(capsule)
             except RemoteError as error:
-                self.refuse(capsule, str(error))
+                self.suspend(capsule, str(error))
 
     def handle(self, wire: bytes, client: Name) -> bytes:
         """Return the answer to a request.
@@ -231,7 +231,7 @@ class CapsuleStore(ClosedOnExit):
         with self._lock:
             return list(self._capsules.values())
 
-    def refuse(self, capsule: StoredCapsule, why: str) -> None:
+    def suspend(self, capsule: StoredCapsule, why: str) -> None:
         """Take no more records of a capsule."""
         capsule.damage = why
         self.note(capsule.name, why)

@@ -69,7 +69,7 @@ def _fetch(store: CapsuleStore, capsule: StoredCapsule, holder: str) -> Generato
             back, has_come = 0, True
         elif other is not None and (other[0] > begin or at == known[-1]):
             number, writer = Record.from_wire(other[1]).number, capsule.descriptor.writer.name
-            store.refuse(capsule, f"record {number} forked: its writer {writer.to_text()} gave {holder} another one")
+            store.suspend(capsule, f"record {number} forked: its writer {writer.to_text()} gave {holder} another one")
             return True
         elif at == known[-1]:
             raise RemoteError(DropReason.MALFORMED, "its records are not the writer's")

@@ -125,7 +125,7 @@ class ImportedTopic:
         if len(self._heard_s) > _HEARD_MAX:
             del self._heard_s[next(iter(self._heard_s))]
         if self._past is not None:
-            self._past.receive(message, now_s)
+            self._past.receive_live(message, now_s)
             self._deliver_past(now_s)
         else:
             self._pass(message, now_s)

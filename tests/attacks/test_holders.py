@@ -112,7 +112,7 @@ def test_k05_a_thief_of_the_writers_key_rewrites_nothing_without_a_name(tmp_path
     assert {each.damage for each in audit.finish()} & {Damage.FORKED, Damage.ROLLED_BACK}
 
 
-def test_k06_a_member_without_the_owners_leave_takes_no_room(tmp_path: Path) -> None:
+def test_k06_a_member_without_the_owners_leave_takes_no_space(tmp_path: Path) -> None:
     site = Site(tmp_path, "site")
     for about in (descriptor("/other", Right.READ), replace(ABOUT, chain=()), replace(ABOUT, begun_ms=NOW_S)):
         request = HolderRequest(ask=Ask.APPEND, capsule=about.name, data=WIRES[0], descriptor=about)

@@ -49,7 +49,7 @@ class Joiner:
         now_s, member = self.world.network.now.mono_s, self.world.members[READER]
         for message in member.poll_messages():
             if message.topic == self.topic:
-                self.join.receive(message, now_s)
+                self.join.receive_live(message, now_s)
             else:
                 self.client.receive(message, now_s)
         if (due_s := self.client.get_timer()) is not None and now_s >= due_s:

@@ -217,7 +217,8 @@ def test_the_past_comes_from_a_store_to_importers_alone(place: Path, side: str, 
     text = f"ros: {{endpoint: ros2, domain: 0}}\n{side}:\n{rules(f'name: /a, history: {history}')}"
     assert f": {side}[0].history: under import this has a 'store', under expose none" in refusal(place, text)
     other = {"expose": "10", "import": "{store: holders, age_s: 60}"}[side]
-    assert proxy(place, text.replace(history, other))
+    config = proxy(place, text.replace(history, other))
+    assert len([*config.expose, *config.imports]) == 1
 
 
 @pytest.mark.parametrize(
