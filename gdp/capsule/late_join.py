@@ -56,6 +56,11 @@ class LateJoin:
         self._is_listed = False
         self._asked: _Writer | None = None
 
+    @property
+    def is_done(self) -> bool:
+        """Return whether the holder has nothing to answer any more, as far as is known."""
+        return self._is_listed and all(each.is_read for each in self._writers.values())
+
     def next_request(self, now_s: float) -> HolderRequest | None:
         """Return what to ask the holder now."""
         if not self._is_listed:

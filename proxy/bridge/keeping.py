@@ -105,7 +105,7 @@ class TopicKeeper:
     def handle(self, now: Timestamps, faults: Faults) -> None:
         """Write and upload what is there, and report what is not kept or not taken by its holder."""
         self.capsules.handle(now)
-        for joining in self._joins.values():
+        for joining in list(self._joins.values()):
             self._ask(joining, now.mono_s, faults)
         for name, kept in (*self.capsules.topics.items(), *self.capsules.ended.items()):
             for detail in kept.poll_faults():
@@ -117,7 +117,8 @@ class TopicKeeper:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return earliest(self.capsules.get_timer(), *[each.due_s for each in self._joins.values()])
+        due_s = [each.due_s for each in self._joins.values() if not each.join.is_done]
+        return earliest(self.capsules.get_timer(), *due_s)
 
     def renew(self, held: DelegationStore) -> None:
         """Replace the delegations: new epochs of the holders' services take effect."""

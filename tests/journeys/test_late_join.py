@@ -99,6 +99,7 @@ def test_the_past_and_the_live_part_are_one_stream(tmp_path: Path, depth: int) -
     joiner, count = joining(tmp_path, depth=depth)
     assert joiner.numbers == list(range(count))
     assert {each.description for each in joiner.got} == {b"described"}
+    assert joiner.join.is_done
 
 
 def test_as_many_as_were_asked_for_come_and_none_that_are_older(tmp_path: Path) -> None:
