@@ -17,6 +17,7 @@ from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from random import SystemRandom
 from typing import Final
 
 from gdp.capsule.audit import Audit
@@ -172,10 +173,12 @@ class CapsuleStore(ClosedOnExit):
         """Return a capsule that another holder has, a new one if it is not here.
 
         Raises:
-            GdpError: its writer had no right when it began, or the disk refuses.
+            GdpError: its writer had no right when it began, a quota has no space for a batch, or the disk refuses.
         """
         with self._lock:
-            return self._capsules.get(descriptor.name) or self._create(descriptor, descriptor.begun_ms / 1e3)
+            capsule = self._capsules.get(descriptor.name) or self._create(descriptor, descriptor.begun_ms / 1e3)
+            self._refuse_above_quota(capsule.parties, capsule, BATCH_BYTES)
+            return capsule
 
     def checkpoints(self, capsule: StoredCapsule) -> list[int]:
         """Return the offsets of its checkpoints, the last one first."""
@@ -277,8 +280,9 @@ class CapsuleStore(ClosedOnExit):
         """Return the total, or what the sender of these lines lacks in part."""
         if len(data) == HASH_BYTES:
             return HolderAnswer(data=self.heads.total)
-        newer = self.heads.newer(b"", data)[:SYNCED_MAX]
-        return HolderAnswer(descriptors=tuple(self._capsules[Name(each)].descriptor for each in newer))
+        newer = self.heads.newer(b"", data)
+        drawn = SystemRandom().sample(newer, min(len(newer), SYNCED_MAX))  # those that it refuses hide no others
+        return HolderAnswer(descriptors=tuple(self._capsules[Name(each)].descriptor for each in drawn))
 
     def _append(self, request: HolderRequest, client: Name) -> HolderAnswer:
         capsule = self._capsules.get(request.capsule)

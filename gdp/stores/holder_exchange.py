@@ -14,7 +14,7 @@ from typing import TypeAlias
 from gdp.capsule.chain import Chain
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
 from gdp.capsule.record import Record, RecordType, split
-from gdp.errors import DropReason, GdpError, RemoteError
+from gdp.errors import DropReason, GdpError, RemoteError, StoreError
 from gdp.names import Name
 from gdp.stores.capsule_store import CapsuleStore, StoredCapsule
 
@@ -35,14 +35,19 @@ def equalise(store: CapsuleStore, holder: str, doubted: set[Name]) -> Steps:
     Args:
         holder: word for it in faults.
         doubted: capsules of which it gave less than it said, the last time.
+
+    Raises:
+        StoreError: the disk refuses.
     """
     total, lines = store.lines()
     is_equal = (yield HolderRequest(ask=Ask.SYNC, data=total)).data == total
     found = () if is_equal else (yield HolderRequest(ask=Ask.SYNC, data=lines)).descriptors
     doubted.intersection_update([each.name for each in found])
     for descriptor in found:
+        is_adopted = False
         try:
             capsule = store.adopt(descriptor)
+            is_adopted = True
             if capsule.damage or (yield from _fetch(store, capsule, holder)):
                 doubted.discard(capsule.name)
             elif capsule.name in doubted:
@@ -51,6 +56,8 @@ def equalise(store: CapsuleStore, holder: str, doubted: set[Name]) -> Steps:
                 doubted.add(capsule.name)
         except GdpError as error:
             store.note(descriptor.name, f"not fetched from {holder}: {error}")
+            if is_adopted and isinstance(error, StoreError):
+                raise
 
 
 def _fetch(store: CapsuleStore, capsule: StoredCapsule, holder: str) -> Generator[HolderRequest, HolderAnswer, bool]:

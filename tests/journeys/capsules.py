@@ -15,7 +15,7 @@ from gdp.capsule.opening import CapsuleOpener, Kept
 from gdp.capsule.record import Record, split
 from gdp.client.participant import Participant
 from gdp.client.send_options import SendOptions
-from gdp.errors import GdpError
+from gdp.errors import GdpError, StoreError
 from gdp.names import Name
 from gdp.service.replication import Mode, Replication
 from gdp.session.keeping import CapsuleKeeper, KeptTopic
@@ -126,6 +126,8 @@ class Holder:
         except StopIteration:
             self.upkeep.ended(peer, now_s)
             return
+        except StoreError:
+            return  # the pause grows
         call = Call(payload=request.to_cbor(), timeout_s=5.0, replication=Replication(Mode.SOME, copies=1))
         self.clients[peer].begin(call, now_s)
         self.exchanges[peer] = steps, call

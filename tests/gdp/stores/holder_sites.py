@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gdp.capsule.chain import Chain, ChainWriter
+from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
 from gdp.capsule.record import Record, RecordType
 from gdp.intervals import HOUR_S
@@ -27,20 +28,22 @@ LIMITS = StoreLimits(owner_bytes=1 << 24, spare_bytes=0)
 class Site:
     """A holder's store, and what it asks of others."""
 
-    def __init__(self, folder: Path, label: str) -> None:
-        self.label, self.folder = label, folder / label
+    def __init__(self, folder: Path, label: str, limits: StoreLimits = LIMITS) -> None:
+        self.label, self.folder, self.limits = label, folder / label, limits
+        self.answered: list[HolderRequest] = []
         self.open()
 
     def open(self) -> None:
-        self.store = CapsuleStore(self.folder, LIMITS, lambda: NOW_S)
+        self.store = CapsuleStore(self.folder, self.limits, lambda: NOW_S)
         self.faults: list[str] = []
         self.doubted: set[Name] = set()
 
-    def append(self, data: bytes, offset: int) -> None:
-        request = HolderRequest(ask=Ask.APPEND, capsule=ABOUT.name, offset=offset, data=data, descriptor=ABOUT)
+    def append(self, data: bytes, offset: int, about: Descriptor = ABOUT) -> None:
+        request = HolderRequest(ask=Ask.APPEND, capsule=about.name, offset=offset, data=data, descriptor=about)
         self.store.handle(request.to_cbor(), writer().name)
 
     def answer(self, request: HolderRequest) -> HolderAnswer:
+        self.answered.append(request)
         return HolderAnswer.from_cbor(self.store.handle(request.to_cbor(), Name(b"h" * 32)))
 
     def fetch(self, other: Site) -> None:

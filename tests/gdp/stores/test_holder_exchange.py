@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import os
+from collections import namedtuple
+from dataclasses import replace
+from pathlib import Path
 from unittest import mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gdp.capsule.holder import Ask
+from gdp.errors import StoreError
 from gdp.stores import capsule_store
 from tests.draws import draws
-from tests.gdp.capsule.owned import writer
-from tests.gdp.stores.holder_sites import ABOUT, CHECKPOINTS, DATA, FILE_BYTES, STARTS, WIRES, Site, forked
+from tests.gdp.capsule.log import Log
+from tests.gdp.capsule.owned import descriptor, writer
+from tests.gdp.stores.holder_sites import ABOUT, CHECKPOINTS, DATA, FILE_BYTES, LIMITS, STARTS, WIRES, Site, forked
 
 
 @given(st.integers(1, len(DATA)), st.integers(1, len(DATA)), st.booleans())
@@ -89,3 +96,29 @@ def test_a_damaged_or_missing_segment_is_repaired_from_another_holder(
         (capsule,) = one.store.capsules
         assert capsule.audit(is_deep=True).findings == []
         assert capsule.damage == ""
+
+
+def test_what_a_quota_refuses_is_not_read_and_hides_no_other_capsule(tmp_path: Path) -> None:
+    abouts = [descriptor(f"/of-one/{number}") for number in range(5)]
+    other = descriptor("/of-another", which=1)
+    full, rich = Site(tmp_path, "full", replace(LIMITS, owner_bytes=4 << 20)), Site(tmp_path, "rich")
+    for about in (*abouts, other):
+        rich.append(b"".join(Log(writer().key, about.name).add(20).closed().wires), 0, about)
+    with mock.patch.object(capsule_store, "SYNCED_MAX", 2):
+        for _ in range(60):
+            full.fetch(rich)
+    held = {capsule.name for capsule in full.store.capsules}
+    assert len(held) == 4
+    read = {each.capsule for each in rich.answered if each.ask is Ask.READ}
+    assert read == held
+    assert any("quota" in each for each in full.faults)
+
+
+def test_a_full_disk_ends_an_exchange(tmp_path: Path) -> None:
+    one, two = Site(tmp_path, "one"), Site(tmp_path, "two")
+    one.append(DATA, 0)
+    Free = namedtuple("Free", "f_bavail f_frsize")
+    with mock.patch.object(os, "statvfs", return_value=Free(1, 512)), pytest.raises(StoreError, match="No space left"):
+        two.fetch(one)
+    two.fetch(one)
+    assert two.data == DATA
