@@ -11,8 +11,8 @@ import pytest
 
 from gdp.stores.keyring import OWNER_PUBLIC
 from gdp.trust.right import Right
-from lab.process import LabProcess
-from netns_tests.session_lab import SessionLab, lines_of, session_lab
+from lab.process import LabProcess, until
+from netns_tests.session_lab import PATIENCE_S, SessionLab, lines_of, session_lab
 from proxy.recordings.reader import BagReader
 from tests.pages import ROOT
 
@@ -107,10 +107,14 @@ def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path
             "gdp-replay", str(drive), "--config", str(config), "--rate", "0", "--wait-readers", "0", "--json"
         )
         assert '"done"' in done.stdout, done.stderr
+
+        def are_equal() -> bool:
+            held = [[each.read_bytes() for each in store.rglob("*.records")] for store in (first, second)]
+            return len(held[0]) == 1 and held[0] == held[1]
+
+        until(are_equal, lambda: f"not equal: {one.logged} {two.logged} {done.stdout} {done.stderr}", PATIENCE_S)
         (segment,) = first.rglob("*.records")
-        (same,) = second.rglob("*.records")
         data = segment.read_bytes()
-        assert same.read_bytes() == data
         one.finish(signal.SIGTERM)
         segment.write_bytes(bytes([*data[:900], data[900] ^ 1, *data[901:]]))
         one = serve("holder", "store-a", "store-b", first)

@@ -135,7 +135,7 @@ class KeptTopic:
     @property
     def is_busy(self) -> bool:
         """Return whether something waits for the disk or a holder."""
-        return bool(self._waiting) or any(each.is_busy for each in self._uploads)
+        return bool(self._waiting) or self.ring.is_writing or any(each.is_busy for each in self._uploads)
 
     def flush(self, time_ns: int) -> None:
         """Append what was sealed to the ring, with checkpoints where they are due."""
@@ -175,7 +175,8 @@ class KeptTopic:
 
     @property
     def is_uploaded(self) -> bool:
-        """Return whether every holder has confirmed all that is here."""
+        """Return whether every holder has confirmed all that was published."""
+        self._publisher.seal_recorded()
         return not self.is_busy and min(self.confirmed) == self.ring.end
 
     def poll_faults(self) -> list[str]:

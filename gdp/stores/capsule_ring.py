@@ -62,6 +62,11 @@ class CapsuleRing:
         return self._waiting_bytes < _WAITING_MAX_BYTES and not self.failure
 
     @property
+    def is_writing(self) -> bool:
+        """Return whether records are under way to the disk."""
+        return self._waiting_bytes > 0
+
+    @property
     def wants_file(self) -> bool:
         """Return whether the next checkpoint is to begin a file."""
         return self._file_bytes >= self.segment_bytes or not self._next
