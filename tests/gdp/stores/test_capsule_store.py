@@ -21,6 +21,7 @@ from gdp.errors import GdpError, LocalError, StoreError
 from gdp.names import Name
 from gdp.stores import capsule_ring, capsule_store
 from gdp.stores.capsule_store import CapsuleStore, StoreLimits, remove, stored
+from gdp.stores.segments import Segments
 from gdp.trust.right import Right
 from tests.gdp.capsule.log import SECOND_NS, Log
 from tests.gdp.capsule.owned import NOW_S, descriptor, writer
@@ -147,6 +148,18 @@ def test_a_time_is_found_and_the_index_is_made_again_where_it_is_gone(holder: Ho
         for file in holder.folder.glob("index.db*"):
             file.unlink()
         holder.restart()
+
+
+def test_a_start_reads_the_last_segment_once_and_no_other_that_is_indexed(
+    holder: Holder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capsule_store, "SEGMENT_BYTES", 4_000)
+    holder.append(b"".join(log_of(count=80).wires), 0)
+    (capsule,) = stored(holder.folder)
+    assert len(capsule.segments.offsets) > 2
+    with mock.patch.object(Segments, "read", autospec=True, side_effect=Segments.read) as read:
+        holder.restart()
+    assert [each.args[1] for each in read.call_args_list] == [capsule.segments.last]
 
 
 def test_an_owner_has_a_quota_for_all_its_topics(tmp_path: Path) -> None:
