@@ -11,7 +11,8 @@ import pytest
 
 from gdp.stores.keyring import OWNER_PUBLIC
 from gdp.trust.right import Right
-from netns_tests.session_lab import SessionLab, lines_of, session_lab
+from lab.process import LabProcess, until
+from netns_tests.session_lab import PATIENCE_S, SessionLab, lines_of, session_lab
 from proxy.recordings.reader import BagReader
 from tests.pages import ROOT
 
@@ -29,6 +30,13 @@ RIGHTS: dict[str, dict[str, Collection[Right]]] = {
 }
 
 
+TWO: dict[str, dict[str, Collection[Right]]] = {
+    "robot": {"/scan": [Right.PUBLISH], "store-a": [Right.CALL], "store-b": [Right.CALL]},
+    "holder": {"store-a": [Right.SERVE], "store-b": [Right.CALL]},
+    "second": {"store-b": [Right.SERVE], "store-a": [Right.CALL]},
+}
+
+
 def content(path: Path) -> dict[str, list[bytes]]:
     """Return the messages of each topic of a recording, in order; a replay gives them stamps of its own."""
     found: dict[str, list[bytes]] = {}
@@ -39,13 +47,14 @@ def content(path: Path) -> dict[str, list[bytes]]:
     return {topic: found[topic] for topic in TOPICS}
 
 
-def robot(lab: SessionLab) -> Path:
+def robot(lab: SessionLab, topics: Collection[str] = tuple(TOPICS), to: object = "store") -> Path:
     """Write the robot's configuration; return it."""
     (lab.folder / "state").mkdir()
     owner = str(lab.folder / "owner" / OWNER_PUBLIC)
     rules = [
-        {"name": name, "type": type_name, "owner": owner, "keep": {"disk": "200MB", "to": "store"}}
+        {"name": name, "type": type_name, "owner": owner, "keep": {"disk": "200MB", "to": to}}
         for name, type_name in TOPICS.items()
+        if name in topics
     ]
     return lab.write(
         "robot", "robot", iface="robot0", delegations="robot/delegations", state="state", expose=rules, sandbox=False
@@ -78,3 +87,38 @@ def test_a_replayed_drive_is_exported_as_it_was_recorded(tmp_path: Path) -> None
         verified = lab.run("gdp", "store", "verify", segment.parent.name, "--store", str(store))
         assert verified.returncode == 1
         assert "altered" in verified.stdout
+
+
+def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path: Path) -> None:
+    with session_lab(TWO, TOPICS) as lab:
+        drive, (first, second) = lab.folder / "drive.mcap", (lab.folder / "a", lab.folder / "b")
+        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
+
+        def serve(node: str, own: str, other: str, store: Path) -> LabProcess:
+            holder = lab.launch(
+                ["gdp", "store", "serve", node, "--service", own, "--peer", other, "--store", str(store), "--json"]
+            )
+            assert '"ready"' in lines_of(holder, 1)[0]
+            return holder
+
+        one, two = serve("holder", "store-a", "store-b", first), serve("second", "store-b", "store-a", second)
+        config = robot(lab, ["/scan"], ["store-a", "store-b"])
+        done = lab.run(
+            "gdp-replay", str(drive), "--config", str(config), "--rate", "0", "--wait-readers", "0", "--json"
+        )
+        assert '"done"' in done.stdout, done.stderr
+
+        def are_equal() -> bool:
+            held = [[each.read_bytes() for each in store.rglob("*.records")] for store in (first, second)]
+            return len(held[0]) == 1 and held[0] == held[1]
+
+        until(are_equal, lambda: f"not equal: {one.logged} {two.logged} {done.stdout} {done.stderr}", PATIENCE_S)
+        (segment,) = first.rglob("*.records")
+        data = segment.read_bytes()
+        one.finish(signal.SIGTERM)
+        segment.write_bytes(bytes([*data[:900], data[900] ^ 1, *data[901:]]))
+        one = serve("holder", "store-a", "store-b", first)
+        words = [json.loads(line)["detail"] for line in lines_of(one, 2)]
+        assert "repaired from store-b" in words[-1]
+        assert segment.read_bytes() == data
+        two.finish(signal.SIGTERM)

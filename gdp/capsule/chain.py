@@ -33,6 +33,7 @@ class Chain:
         number: of the next record.
         first: number of the last checkpoint.
         head: end of the hash chain.
+        proven: the same behind the last checkpoint.
         leaves: hashes of the records from the last checkpoint on.
         time_ns: of the last record.
         sequence: sequence number behind the last message.
@@ -42,7 +43,7 @@ class Chain:
         self.name = name
         self._key = key
         self.number = self.first = self.time_ns = self.sequence = 0
-        self.head = hashlib.sha256(b"gdp-capsule-1" + name).digest()
+        self.head = self.proven = hashlib.sha256(b"gdp-capsule-1" + name).digest()
         self.leaves: list[bytes] = []
 
     def handle_record(self, wire: bytes, *, may_skip: bool = False) -> Record:
@@ -80,7 +81,7 @@ class Chain:
         leaf = leaf_of(wire)
         self.head = hashlib.sha256(self.head + leaf).digest()
         if record.type is RecordType.CHECKPOINT:
-            self.leaves, self.first = [], record.number
+            self.leaves, self.first, self.proven = [], record.number, self.head
         self.leaves.append(leaf)
         self.number, self.time_ns = record.number + 1, record.time_ns
         if record.messages:

@@ -17,6 +17,7 @@ from gdp.names import ZERO, Name
 BATCH_BYTES: Final = 512 << 10  # of records in one request or answer
 YIELDING_BYTES: Final = 16 << 10  # ... in one request next to live traffic
 LISTED_MAX: Final = 1_024
+SYNCED_MAX: Final = 64  # capsules that one request finds different
 
 
 class Ask(str, Enum):
@@ -27,6 +28,7 @@ class Ask(str, Enum):
     READ = "read"
     LIST = "list"
     MARKS = "marks"  # the latest ones, as records
+    SYNC = "sync"  # ``data``: the total of what the client holds, or lines of it (``gdp/exchange/sync_set.py``)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,9 +63,9 @@ class HolderAnswer(FieldSet):
     Attributes:
         head: behind the last byte that is on its disk.
         offset: what is to be appended next; of records that were read, where they begin: as asked, or behind a gap.
-        data: records, or a part of the last one.
+        data: records, or a part of the last one; the holder's total.
         described: the record with the description that holds where ``data`` begins, if records before it are skipped.
-        descriptors: of the listed capsules.
+        descriptors: of the listed capsules, or of those that the client lacks in part.
     """
 
     MAX_BYTES = MESSAGE_MAX_BYTES

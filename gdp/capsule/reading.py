@@ -5,7 +5,8 @@ Sans-I/O. Records of another time are skipped; what is damaged or missing is nam
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 from gdp.capsule.audit import Audit
@@ -14,7 +15,7 @@ from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
 from gdp.capsule.opening import CapsuleOpener, Kept
 from gdp.capsule.record import RECORD_MAX_BYTES, RECORD_MIN_BYTES, Record, find, size_of
 from gdp.client.key_epochs import Secrets
-from gdp.errors import RemoteError
+from gdp.errors import GdpError, RemoteError
 
 _END_NS: Final = (1 << 63) - 1
 
@@ -25,6 +26,16 @@ class Lost(NamedTuple):
     incarnation: int
     first: int
     last: int
+
+
+def given(found: Iterable[Descriptor]) -> list[Descriptor]:
+    """Return those whose writer the topic's owner let publish when the capsule began."""
+    rightful = list[Descriptor]()
+    for each in found:
+        with suppress(GdpError):
+            each.check_right(each.begun_ms / 1e3)
+            rightful.append(each)
+    return rightful
 
 
 class CapsuleReader:

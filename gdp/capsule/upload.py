@@ -13,9 +13,11 @@ from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import BATCH_BYTES, Ask, HolderAnswer, HolderRequest
 from gdp.capsule.windows import Windows
 from gdp.errors import RemoteError
-from gdp.intervals import NEVER_S, RETRY_S
+from gdp.intervals import MINUTE_S, NEVER_S, POLL_S, RETRY_S
 from gdp.names import Name
+from gdp.requests import Backoff
 
+_FAILED: Final = Backoff(RETRY_S, MINUTE_S)
 _FAULTS_MAX: Final = 15  # of those that nothing has read
 
 
@@ -41,12 +43,21 @@ class Uploader:
         self._head: int | None = None  # None: it is to be asked for
         self._is_under_way = False
         self._retry_s = -NEVER_S
+        self._failures = 0  # in a row
+        self._is_chosen = True
         self.confirmed = 0
         self.is_refused = False
         self._faults: list[str] = []
 
     def next_step(
-        self, begin: int, end: int, now_s: float, windows: Windows | None = None, most_bytes: int = BATCH_BYTES
+        self,
+        begin: int,
+        end: int,
+        now_s: float,
+        windows: Windows | None = None,
+        most_bytes: int = BATCH_BYTES,
+        *,
+        is_chosen: bool = True,
     ) -> HolderRequest | Span | None:
         """Return a request to send, or what to read for the next one, or None.
 
@@ -55,9 +66,15 @@ class Uploader:
             end: behind the last byte on the disk here.
             windows: what stands in none of them is left out; None: everything is uploaded.
             most_bytes: of one request.
+            is_chosen: records go to this holder; another one fetches them from it, and is asked what it has.
         """
         if self._is_under_way or now_s < self._retry_s:
             return None
+        self._is_chosen = is_chosen
+        if not is_chosen:
+            if self.confirmed == end or (windows is not None and windows.next(self.confirmed, end) is None):
+                return None
+            self._head = None
         if self._head is None:
             self._is_under_way = True
             return HolderRequest(ask=Ask.HEAD, capsule=self._name)
@@ -86,7 +103,7 @@ class Uploader:
         except RemoteError as error:
             self.handle_failure(f"an answer that cannot be read: {error}", now_s)
             return
-        self._is_under_way, self.is_refused, head = False, False, answer.head
+        self._is_under_way, self.is_refused, self._failures, head = False, False, 0, answer.head
         if head < self.confirmed:
             self._note(f"the holder has rolled back: {self.confirmed} bytes were confirmed, now it has {head}")
         elif head > end:
@@ -95,16 +112,15 @@ class Uploader:
             self._head = None
             return
         self.confirmed, self._head = head, max(head, answer.offset)
+        if not self._is_chosen:
+            self._retry_s = now_s + POLL_S
 
     def handle_failure(self, reason: str, now_s: float) -> None:
         """Note that a request failed: the holder is asked for its head again after a while."""
         self._note(reason)
         self.is_refused = True
-        self._is_under_way, self._head, self._retry_s = False, None, now_s + RETRY_S
-
-    def get_timer(self) -> float:
-        """Return the monotonic second from which ``next_step`` may return something again."""
-        return NEVER_S if self._is_under_way else self._retry_s
+        self._failures += 1
+        self._is_under_way, self._head, self._retry_s = False, None, now_s + _FAILED.pause_s(self._failures)
 
     def poll_faults(self) -> list[str]:
         """Return, once, what the holder did wrong, refused or never had, as texts; the latest last."""

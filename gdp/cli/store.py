@@ -6,13 +6,16 @@ I/O. ``export`` and ``replay`` are commands of the package ``proxy``.
 from __future__ import annotations
 
 import json as json_text
+import logging
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
 import typer
 
+from gdp.capsule.holder import HolderAnswer, HolderRequest
 from gdp.capsule.record import Record, RecordType, split
 from gdp.capsule.windows import Mark
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
@@ -20,13 +23,17 @@ from gdp.cli.local_nodes import Node as LocalNode
 from gdp.cli.local_nodes import connect
 from gdp.cli.node import Json, Logs, failing_clearly, report, running
 from gdp.cli.program import ungrouped
-from gdp.errors import LocalError
-from gdp.intervals import ANSWER_S, DAY_S
+from gdp.errors import GdpError, LocalError
+from gdp.intervals import ANSWER_S, DAY_S, UPKEEP_S
 from gdp.names import Name
 from gdp.session.protocol.messages import Request
-from gdp.session.session import open_session
+from gdp.session.session import Session, open_session
 from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, StoreLimits, marks_of, remove, stored
+from gdp.stores.holder_exchange import run
+from gdp.stores.holder_upkeep import HolderUpkeep
 from gdp.terminal import echo
+
+log = logging.getLogger(__name__)
 
 
 class _Store(ExtendedGroup):
@@ -52,11 +59,17 @@ def serve(
     most: Annotated[
         float | None, typer.Option(min=0.001, metavar="GB", help="Of one capsule, whose oldest segments go.")
     ] = None,
+    peer: Annotated[
+        list[str] | None, typer.Option(metavar="SERVICE", help="Another holder, to become equal with. Repeatable.")
+    ] = None,
     json: Json = False,
     *,
     logs: Logs,
 ) -> None:
-    """Hold capsules until Ctrl-C. What is confirmed to a writer is on the disk; a full disk and a quota refuse."""
+    """Hold capsules until Ctrl-C. What is confirmed to a writer is on the disk; a full disk and a quota refuse.
+
+    All is read again slowly; what is damaged is repaired from another holder, and printed.
+    """
     limits = StoreLimits(
         owner_bytes=int(quota * 1e9),
         capsule_bytes=None if most is None else int(most * 1e9),
@@ -70,7 +83,17 @@ def serve(
         server = session.serve(service, answer, workers=2, priority="background")
         text = f"holder {session.name.short} serves {service}; Ctrl-C ends it"
         report("ready", text, json=json, name=str(server.name))
-        server.serve_forever()
+        upkeep = HolderUpkeep(capsules, peer or (), time.monotonic())
+        while not server.is_closed_within(UPKEEP_S):
+            for holder, steps in upkeep.handle_timer(time.monotonic()):
+                try:
+                    run(steps, partial(ask, session, holder))
+                except GdpError as error:
+                    log.warning("no exchange holder=%s reason=%s", holder, error)
+                else:
+                    upkeep.ended(holder, time.monotonic())
+            for name, fault in capsules.poll_faults().items():
+                report("fault", f"capsule {name.short}: {fault}", json=json, capsule=name.to_text(), detail=fault)
 
 
 @app.command("ls", epilog="Example: gdp store ls --store /var/lib/gdp/capsules")
@@ -160,6 +183,11 @@ def rm(name: Which, store: Folder, json: Json = False) -> None:
 
 for _name in _Store.extensions:
     app.command(_name, context_settings=ANY_ARGUMENTS)(placeholder)
+
+
+def ask(session: Session, holder: str, request: HolderRequest) -> HolderAnswer:
+    """Return a holder's answer. Raises ``GdpError``: there is none."""
+    return HolderAnswer.from_cbor(session.call(holder, request.to_cbor(), replication=1).payload)
 
 
 def _find(store: Path, digits: str) -> StoredCapsule:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -17,7 +18,7 @@ from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import BATCH_BYTES, YIELDING_BYTES, HolderRequest
 from gdp.capsule.record import RecordType
 from gdp.capsule.upload import Uploader
-from gdp.capsule.windows import Mark, Place
+from gdp.capsule.windows import Mark, Place, Windows
 from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import SendOptions
@@ -48,15 +49,73 @@ class _Waiting(NamedTuple):
     mark: Mark | None = None
 
 
+class _Upload:
+    """Upload of one topic's records to one holder.
+
+    Attributes:
+        holder: name of its service.
+    """
+
+    def __init__(self, ring: CapsuleRing, holder: Name) -> None:
+        self._ring = ring
+        self.holder = holder
+        self.uploader = Uploader(ring.descriptor.name, ring.descriptor)
+        self.reading: Future[tuple[int, bytes]] | None = None
+        self._call: Call | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        """Return whether it waits for the disk or the holder."""
+        return bool(self.reading or self._call)
+
+    def handle_call(self, now_s: float) -> None:
+        """Process the answer if there is one."""
+        call, uploader = self._call, self.uploader
+        if call is not None and call.is_done:
+            self._call = None
+            if call.response is not None:
+                uploader.handle_response(call.response.payload, self._ring.end, now_s)
+            else:
+                uploader.handle_failure(str(call.error), now_s)
+
+    def send_next(
+        self, client: ClientCore, now_s: float, windows: Windows | None, most_bytes: int, *, is_chosen: bool
+    ) -> None:
+        """Send the next request if none is under way, as of ``Uploader``; with ``most_bytes`` 0 begin none."""
+        reading, uploader, ring = self.reading, self.uploader, self._ring
+        if reading is not None and reading.done():
+            self.reading = None
+            try:
+                offset, data = reading.result()
+            except GdpError as error:
+                uploader.handle_failure(str(error), now_s)
+            else:
+                self._ask(uploader.append(offset, data), client, now_s)
+        if not most_bytes:
+            return
+        wanted = uploader.next_step(ring.begin, ring.end, now_s, windows, most_bytes, is_chosen=is_chosen)
+        if isinstance(wanted, HolderRequest):
+            self._ask(wanted, client, now_s)
+        elif wanted is not None:
+            self.reading = ring.read(wanted.offset, wanted.size)
+            if self.reading.done():
+                self.send_next(client, now_s, windows, most_bytes, is_chosen=is_chosen)
+
+    def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
+        self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
+        client.begin(self._call, now_s)
+
+
 class KeptTopic:
     """One topic that is kept.
+
+    The records go to the holder that has most, and the others fetch them from it: the uplink carries them once.
 
     Args:
         around_ns: what is kept before and after each mark; None: everything is.
 
     Attributes:
         ring: on the disk here.
-        uploader: to the holder.
         lost: messages that the disk here did not take in time.
     """
 
@@ -65,15 +124,15 @@ class KeptTopic:
         publisher: Publisher,
         ring: CapsuleRing,
         key: Identity,
-        holder: Name,
+        holders: Sequence[Name],
         around_ns: tuple[int, int] | None = None,
     ) -> None:
         self._publisher = publisher
         self.ring = ring
-        self.holder = holder
         self.name = ring.descriptor.name
         self._writer = ChainWriter(ring.chain, key.key)
-        self.uploader = Uploader(self.name, ring.descriptor)
+        self._uploads = [_Upload(ring, holder) for holder in holders]
+        self._chosen = self._uploads[0]
         self._windows = None if around_ns is None else ring.windows(*around_ns)
         self._mark = ring.mark  # number of the record of the last one
         self._marked: dict[str, int] = {}  # when each name was marked last
@@ -82,14 +141,22 @@ class KeptTopic:
         self._described: list[bytes] = []  # frames of the latest description in the ring
         self._describes = False  # it is repeated before the next message
         self.lost = self._reported = 0
-        self._reading: Future[tuple[int, bytes]] | None = None
-        self._call: Call | None = None
         publisher.record(self._record, self._describe)
 
     @property
+    def uploader(self) -> Uploader:
+        """Return that to the holder which gets the records."""
+        return self._chosen.uploader
+
+    @property
+    def confirmed(self) -> tuple[int, ...]:
+        """Return how many bytes each holder has, as it confirmed."""
+        return tuple(each.uploader.confirmed for each in self._uploads)
+
+    @property
     def is_busy(self) -> bool:
-        """Return whether something waits for the disk or the holder."""
-        return bool(self._waiting or self._reading or self._call or not self.ring.is_written)
+        """Return whether something waits for the disk or a holder."""
+        return bool(self._waiting) or not self.ring.is_written or any(each.is_busy for each in self._uploads)
 
     def flush(self, time_ns: int) -> None:
         """Append what was sealed to the ring, with checkpoints where they are due."""
@@ -118,7 +185,7 @@ class KeptTopic:
                 if windows.is_due(time_ns) and not self._waiting:
                     windows.close(self.ring.next)
                 windows.add_checkpoint(at)
-                self.ring.trim(windows.drop(self.uploader.confirmed))
+                self.ring.trim(windows.drop(min(self.confirmed)))
             # what is before may be left out or dropped, and its description with it
             self._describes = begins_file or windows is not None
         self._append(pieces)
@@ -148,50 +215,42 @@ class KeptTopic:
         if pieces:
             self.ring.append(b"".join(pieces), begins_file=False)
 
-    def upload(self, client: ClientCore, now_s: float, most_bytes: int) -> None:
-        """Send the next request, with records of this size at most, if none is under way; 0: begin none."""
-        call, reading, uploader = self._call, self._reading, self.uploader
-        if call is not None and call.is_done:
-            self._call = None
-            if call.response is not None:
-                uploader.handle_response(call.response.payload, self.ring.end, now_s)
-            else:
-                uploader.handle_failure(str(call.error), now_s)
-        if reading is not None and reading.done():
-            self._reading = None
-            try:
-                offset, data = reading.result()
-            except GdpError as error:
-                uploader.handle_failure(str(error), now_s)
-            else:
-                self._ask(uploader.append(offset, data), client, now_s)
-        if not most_bytes:
-            return
-        wanted = uploader.next_step(self.ring.begin, self.ring.end, now_s, self._windows, most_bytes)
-        if isinstance(wanted, HolderRequest):
-            self._ask(wanted, client, now_s)
-        elif wanted is not None:
-            self._reading = self.ring.read(wanted.offset, wanted.size)
-            if self._reading.done():
-                self.upload(client, now_s, most_bytes)
+    def upload(self, clients: Mapping[Name, ClientCore], now_s: float, yielding_bytes: int) -> None:
+        """Send the next requests where none is under way.
+
+        Args:
+            yielding_bytes: of records in one, at most, while the ring has space; 0: begin none.
+        """
+        for each in self._uploads:
+            each.handle_call(now_s)
+        if not self._chosen.is_busy:
+            ready = [each for each in self._uploads if not each.uploader.is_refused] or self._uploads
+            self._chosen = max(ready, key=lambda each: (each.uploader.confirmed, each is self._chosen))
+        most_bytes = BATCH_BYTES if self.ring.is_pressed(self.uploader.confirmed) else yielding_bytes
+        for each in self._uploads:
+            client = clients[each.holder]
+            each.send_next(client, now_s, self._windows, most_bytes, is_chosen=each is self._chosen)
 
     @property
     def is_reading(self) -> bool:
         """Return whether the disk is read for the next request."""
-        return self._reading is not None
+        return self._chosen.reading is not None
 
     @property
     def is_uploaded(self) -> bool:
-        """Return whether the holder has confirmed all that is here."""
-        confirmed, begin, end = self.uploader.confirmed, self.ring.begin, self.ring.end
-        windows = self._windows
-        is_whole = confirmed == end if windows is None else windows.next(max(confirmed, begin), end) is None
+        """Return whether every holder has confirmed all that was published, or stands in a window."""
+        self._publisher.seal_recorded()
+        confirmed, end, windows = min(self.confirmed), self.ring.end, self._windows
+        is_whole = confirmed == end if windows is None else windows.next(max(confirmed, self.ring.begin), end) is None
         return is_whole and not self.is_busy
 
     def poll_faults(self) -> list[str]:
-        """Return, once, what went wrong: what the holder refused or never had, and messages that are not kept."""
-        faults, lost = self.uploader.poll_faults(), self.lost - self._reported
-        self._reported = self.lost
+        """Return, once, what went wrong: what a holder refused or never had, and messages that are not kept."""
+        faults = [each for upload in self._uploads for each in upload.uploader.poll_faults()]
+        if len(self._uploads) > 1:
+            have = sum(each >= max(self.confirmed) for each in self.confirmed)
+            faults = [f"{have} of {len(self._uploads)} holders have it: {each}" for each in faults]
+        lost, self._reported = self.lost - self._reported, self.lost
         why = self.ring.failure or "the disk is too slow"
         return [*faults, f"{lost} messages are not kept: {why}"] if lost else faults
 
@@ -200,10 +259,6 @@ class KeptTopic:
         self.flush(time_ns)
         if self._writer.has_new and self.ring.is_ready:
             self._append([self._writer.checkpoint(time_ns)])
-
-    def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
-        self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
-        client.begin(self._call, now_s)
 
     def _record(self, frames: Sealed, sequence: int, messages: int) -> None:
         if self._waiting_bytes + frames.size_bytes > WINDOW_BYTES:
@@ -247,7 +302,7 @@ class CapsuleKeeper:
         self,
         topic: Topic,
         publisher: Publisher,
-        holder: Topic,
+        holders: Sequence[Topic],
         most_bytes: int,
         unix_s: float,
         around_ns: tuple[int, int] | None = None,
@@ -255,7 +310,7 @@ class CapsuleKeeper:
         """Keep what a publisher publishes from now on.
 
         Args:
-            holder: the delegation to call the holder's service.
+            holders: the delegations to call the holders' services, the preferred one first.
             most_bytes: of the ring.
             around_ns: as of ``KeptTopic``.
 
@@ -267,12 +322,26 @@ class CapsuleKeeper:
             before.ring.close()
         descriptor = Descriptor(delegation.subject, self._identity.membership, delegation.chain, int(unix_s * 1e3))
         ring = CapsuleRing(self._folder / topic.name.to_text(), descriptor, most_bytes, self._pool)
-        if holder.name not in self._clients:
-            label = f"holder {holder.name.short}"
-            self._clients[holder.name] = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
-        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, holder.name, around_ns)
+        for holder in holders:
+            self._client(holder)
+        names = [holder.name for holder in holders]
+        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, names, around_ns)
         log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
         return kept
+
+    def ask(self, holder: Topic, request: HolderRequest, now_s: float) -> Call:
+        """Ask a holder; the call ends later. Raises ``LocalError``: no delegation."""
+        call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
+        self._client(holder).begin(call, now_s)
+        return call
+
+    def _client(self, holder: Topic) -> ClientCore:
+        client = self._clients.get(holder.name)
+        if client is None:
+            label = f"holder {holder.name.short}"
+            client = ClientCore(self._member, holder, label, start=self._start, options=_BACKGROUND)
+            self._clients[holder.name] = client
+        return client
 
     def release(self, topic: Name, unix_s: float) -> None:
         """Keep a topic no more; what waits is uploaded. Its capsule is continued when it is kept again."""
@@ -301,8 +370,7 @@ class CapsuleKeeper:
                 client.handle_timer(now.mono_s)
         yielding_bytes = self._yielding_bytes(now.mono_s)
         for kept in (*self.topics.values(), *self.ended.values()):
-            most_bytes = BATCH_BYTES if kept.ring.is_pressed(kept.uploader.confirmed) else yielding_bytes
-            kept.upload(self._clients[kept.holder], now.mono_s, most_bytes)
+            kept.upload(self._clients, now.mono_s, yielding_bytes)
             if kept.is_reading:
                 self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
         for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
@@ -335,13 +403,12 @@ class CapsuleKeeper:
     @property
     def confirmed(self) -> int:
         """Return how many bytes the holders have confirmed."""
-        return sum(each.uploader.confirmed for each in (*self.topics.values(), *self.ended.values()))
+        return sum(sum(each.confirmed) for each in (*self.topics.values(), *self.ended.values()))
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        if not self.topics and not self.ended:
-            return None
-        return earliest(self._due_s, *[each.get_timer() for each in self._clients.values()])
+        due_s = self._due_s if self.topics or self.ended else None
+        return earliest(due_s, *[each.get_timer() for each in self._clients.values()])
 
     def close(self, unix_s: float) -> None:
         """Put everything on the disk."""

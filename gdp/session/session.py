@@ -148,10 +148,14 @@ class Server(BaseServer[Driver, Handler], ClosedOnExit):
 
     def serve_forever(self) -> None:
         """Wait until the server or the session is closed, for a program that only serves."""
+        self.is_closed_within(None)
+
+    def is_closed_within(self, timeout_s: float | None) -> bool:
+        """Wait so long at most until the server or the session is closed; return whether it is. None: no limit."""
         try:
-            self._driver.wait(lambda: self._is_closed, None)
+            return self._driver.wait(lambda: self._is_closed, _deadline_s(self._driver, timeout_s))
         except ClosedError:
-            return
+            return True
 
     def _work(self) -> None:
         """Handle requests one after the other, as one of the workers."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from concurrent.futures import Executor, Future
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from gdp.capsule.chain import Chain
 from gdp.capsule.descriptor import Descriptor
@@ -24,6 +24,8 @@ log = logging.getLogger(__name__)
 DESCRIPTOR: Final = "descriptor.cbor"
 _PARTS: Final = 8  # of the ring, at least: so much is dropped at once
 _WAITING_MAX_BYTES: Final = 32 << 20
+
+IndexedRecord: TypeAlias = tuple[int, Record, bytes]  # offset and wire form of a record that is no message
 
 
 class CapsuleRing:
@@ -154,7 +156,7 @@ def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain,
             if (before.topic, before.writer) != (descriptor.topic, descriptor.writer):
                 continue
             segments = Segments(place)
-            chain = replayed(before, segments)
+            chain, _ = replayed(before, segments)
         except GdpError as error:
             log.warning("capsule cannot be continued, another begins path=%s reason=%s", place, error)
             continue
@@ -164,14 +166,20 @@ def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain,
     return descriptor, Chain(descriptor.name, descriptor.key), Segments(place)
 
 
-def replayed(descriptor: Descriptor, segments: Segments) -> Chain:
-    """Return the chain behind the last whole record; a torn write is cut. Raises ``RemoteError``: damage before it."""
+def replayed(descriptor: Descriptor, segments: Segments) -> tuple[Chain, list[IndexedRecord]]:
+    """Return the chain behind the last whole record, and what an index has of the last file.
+
+    A torn write is cut. Raises ``RemoteError``: damage before it.
+    """
     while segments.offsets:
         chain, last, at = Chain(descriptor.name, descriptor.key), segments.last, 0
+        found = list[IndexedRecord]()
         data = segments.read(last, segments.size_of(last))[1]
         try:
             for wire in split(data):
-                chain.handle_record(wire, may_skip=True)
+                record = chain.handle_record(wire, may_skip=True)
+                if record.type is not RecordType.MESSAGE:
+                    found.append((last + at, record, wire))
                 at += len(wire)
         except RemoteError:
             if find(data, at) is not None:
@@ -179,6 +187,6 @@ def replayed(descriptor: Descriptor, segments: Segments) -> Chain:
         if at:
             if at < len(data):
                 segments.cut(last + at)
-            return chain
+            return chain, found
         segments.drop(last)
-    return Chain(descriptor.name, descriptor.key)
+    return Chain(descriptor.name, descriptor.key), []

@@ -12,22 +12,24 @@ import logging
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
+from random import SystemRandom
 from typing import Final
 
 from gdp.capsule.audit import Audit
-from gdp.capsule.chain import Chain
+from gdp.capsule.chain import CHECKPOINT_BYTES, Chain
 from gdp.capsule.descriptor import Descriptor
-from gdp.capsule.holder import BATCH_BYTES, LISTED_MAX, Ask, HolderAnswer, HolderRequest
+from gdp.capsule.holder import BATCH_BYTES, LISTED_MAX, SYNCED_MAX, Ask, HolderAnswer, HolderRequest
 from gdp.capsule.record import RECORD_MAX_BYTES, Record, RecordType, number_of, split
 from gdp.closing import ClosedOnExit
 from gdp.errors import GdpError, LocalError, RemoteError, StoreError
+from gdp.exchange.sync_set import HASH_BYTES, SyncSet
 from gdp.names import ZERO, Name
-from gdp.stores.capsule_ring import DESCRIPTOR, replayed
+from gdp.stores.capsule_ring import DESCRIPTOR, IndexedRecord, replayed
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.segments import SEGMENT_BYTES, Segments
 from gdp.stores.transactions import TransactionFile
@@ -36,6 +38,8 @@ log = logging.getLogger(__name__)
 
 _RESTS_MAX_BYTES: Final = 4 * RECORD_MAX_BYTES
 _MARKS_MAX: Final = 1_024  # in one answer
+_PARTIES: Final = "topics' owner", "writer"
+_HEAD_BITS: Final = 24  # of the chain's head in a rank
 SPARE_BYTES: Final = 256 << 20  # of the disk, for what others write
 _TABLE: Final = """
 CREATE TABLE IF NOT EXISTS checkpoints (
@@ -54,7 +58,7 @@ class StoreLimits:
     """Limits of a holder.
 
     Attributes:
-        owner_bytes: of all capsules of one owner's topics.
+        owner_bytes: of all capsules of one owner's topics, and of one writer's; an empty one counts for a MiB.
         capsule_bytes: beyond it the oldest segments of a capsule go; None: no limit.
         age_s: older segments go; None: no limit.
         spare_bytes: free space of the disk below which appends are refused.
@@ -71,26 +75,25 @@ class StoredCapsule:
 
     Attributes:
         chain: state after the last whole record.
+        checkpoint: offset of its last checkpoint.
         rest: bytes of a record whose end has not come; in memory alone, and not confirmed.
-        damage: of its last segment, which takes no records then; empty: none.
+        parties: key of the topic's owner, and name of the writer.
+        damage: why it takes no records; empty: it does.
     """
 
     def __init__(self, folder: Path, spare_bytes: int = 0) -> None:
         self.descriptor = Descriptor.from_cbor(read_private(folder / DESCRIPTOR))
-        self.name, self.owner = self.descriptor.name, self.descriptor.topic.owner_key
+        self.name, self.parties = self.descriptor.name, _parties_of(self.descriptor)
         self.segments = Segments(folder, spare_bytes)
         self.chain = Chain(self.name, self.descriptor.key)
         self.rest = b""
+        self.checkpoint = 0
         self.damage = ""
 
     @property
     def next(self) -> int:
         """Return the offset that is expected next."""
         return self.segments.end + len(self.rest)
-
-    def resume(self) -> None:
-        """Read the last segment, so that records can be appended. Raises ``RemoteError``: it is damaged."""
-        self.chain = replayed(self.descriptor, self.segments)
 
     def audit(self, *, known: bytes | None = None, is_deep: bool = False) -> Audit:
         """Return the finished audit of all segments."""
@@ -120,6 +123,9 @@ class CapsuleStore(ClosedOnExit):
     Args:
         unix_s: returns the present Unix second.
 
+    Attributes:
+        heads: of each capsule, where its last checkpoint is, with first bytes of the chain's head there.
+
     Raises:
         GdpError: the folder cannot be read or written.
     """
@@ -132,14 +138,15 @@ class CapsuleStore(ClosedOnExit):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._index = TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL")
         self._capsules: dict[Name, StoredCapsule] = {}
+        self.heads = SyncSet[int](int)
+        self._faults: dict[Name, str] = {}
+        self._new_faults: dict[Name, str] = {}
         for capsule in stored(folder, limits.spare_bytes):
             self._capsules[capsule.name] = capsule
             try:
-                capsule.resume()
-                self._index_missing(capsule)
+                self._resume(capsule)
             except RemoteError as error:
-                capsule.damage = str(error)
-                log.error("capsule damaged, takes no records name=%s reason=%s", capsule.name.short, error)
+                self.suspend(capsule, str(error))
 
     def handle(self, wire: bytes, client: Name) -> bytes:
         """Return the answer to a request.
@@ -153,6 +160,8 @@ class CapsuleStore(ClosedOnExit):
                 return self._list(request.topic).to_cbor()
             if request.ask is Ask.APPEND:
                 return self._append(request, client).to_cbor()
+            if request.ask is Ask.SYNC:
+                return self._compare(request.data).to_cbor()
             capsule = self._capsules.get(request.capsule)
             if capsule is None:
                 return HolderAnswer().to_cbor()
@@ -161,6 +170,95 @@ class CapsuleStore(ClosedOnExit):
             if request.ask is Ask.HEAD:
                 return HolderAnswer(head=capsule.segments.end, offset=capsule.segments.end).to_cbor()
             return self._read(capsule, request).to_cbor()
+
+    def lines(self) -> tuple[bytes, bytes]:
+        """Return the total of what is held, and lines of it, for a request to another holder."""
+        with self._lock:
+            return self.heads.total, self.heads.lines(b"")
+
+    def adopt(self, descriptor: Descriptor) -> StoredCapsule:
+        """Return a capsule that another holder has, a new one if it is not here.
+
+        Raises:
+            GdpError: its writer had no right when it began, a quota has no space for a batch, or the disk refuses.
+        """
+        with self._lock:
+            capsule = self._capsules.get(descriptor.name) or self._create(descriptor, descriptor.begun_ms / 1e3)
+            self._refuse_above_quota(capsule.parties, capsule, BATCH_BYTES)
+            return capsule
+
+    def checkpoints(self, capsule: StoredCapsule) -> list[int]:
+        """Return the offsets of its checkpoints, the last one first."""
+        with self._index.reading() as index:
+            rows = index.execute(
+                "SELECT offset FROM checkpoints WHERE capsule = ? ORDER BY offset DESC", (capsule.name,)
+            ).fetchall()
+        return [offset for (offset,) in rows]
+
+    def add(self, capsule: StoredCapsule, offset: int, data: bytes) -> bool:
+        """Append proven records of another holder; return whether any of them were missing at the end.
+
+        Raises:
+            GdpError: as ``handle``.
+        """
+        with self._lock:
+            before = capsule.segments.end
+            self._add(capsule, offset, data)
+        return capsule.segments.end != before
+
+    def replace(self, capsule: StoredCapsule, offset: int, data: bytes) -> bool:
+        """Replace the beginning of a segment by proven records of another holder; return whether that changed it.
+
+        Raises:
+            GdpError: the disk refuses, or what is behind them is still damaged.
+        """
+        segments = capsule.segments
+        with self._lock:
+            old = segments.read(offset, segments.size_of(offset))[1]
+            new = data + old[len(data) :]
+            if new == old or (offset not in segments.offsets and offset > segments.begin):
+                return False  # or it was dropped meanwhile
+            segments.replace(offset, new)
+            if capsule.damage and offset == segments.last:
+                self._resume(capsule)
+            self._index_records(capsule, offset, data)
+            return True
+
+    def retire(self, capsule: StoredCapsule) -> None:
+        """Drop the oldest segments beyond the limits; the last one stays."""
+        with self._lock:
+            self._retire(capsule)
+
+    def gaps(self, capsule: StoredCapsule) -> list[int]:
+        """Return where the segments begin behind which bytes are missing; 0: before the first, and none are dropped."""
+        segments, limits = capsule.segments, self._limits
+        gaps = [each for each, later in pairwise(segments.offsets) if each + segments.size_of(each) < later]
+        return [0, *gaps] if segments.begin and limits.capsule_bytes is limits.age_s is None else gaps
+
+    @property
+    def capsules(self) -> list[StoredCapsule]:
+        """Return the capsules here."""
+        with self._lock:
+            return list(self._capsules.values())
+
+    def suspend(self, capsule: StoredCapsule, why: str) -> None:
+        """Take no more records of a capsule."""
+        capsule.damage = why
+        self.note(capsule.name, why)
+
+    def note(self, name: Name, fault: str) -> None:
+        """Note what is wrong with a capsule, here or at another holder; the same is reported once."""
+        if self._faults.get(name) != fault:
+            self._faults[name] = fault
+            self._new_faults[name] = fault
+            if len(self._faults) > LISTED_MAX:
+                del self._faults[next(iter(self._faults))]
+            log.error("capsule fault name=%s reason=%s", name.short, fault)
+
+    def poll_faults(self) -> dict[Name, str]:
+        """Return, once, new faults by capsule."""
+        faults, self._new_faults = self._new_faults, {}
+        return faults
 
     def close(self) -> None:
         """Close all files."""
@@ -193,24 +291,40 @@ class CapsuleStore(ClosedOnExit):
             described = b"" if row is None else row[0]
         return HolderAnswer(head=segments.end, offset=offset, data=data, described=described)
 
+    def _compare(self, data: bytes) -> HolderAnswer:
+        """Return the total, or what the sender of these lines lacks in part."""
+        if len(data) == HASH_BYTES:
+            return HolderAnswer(data=self.heads.total)
+        newer = self.heads.newer(b"", data)
+        drawn = SystemRandom().sample(newer, min(len(newer), SYNCED_MAX))  # those that it refuses hide no others
+        return HolderAnswer(descriptors=tuple(self._capsules[Name(each)].descriptor for each in drawn))
+
     def _append(self, request: HolderRequest, client: Name) -> HolderAnswer:
-        capsule = self._capsules.get(request.capsule) or self._create(request, client)
+        capsule = self._capsules.get(request.capsule)
+        if capsule is None:
+            descriptor = request.descriptor
+            if descriptor is None or descriptor.name != request.capsule:
+                raise LocalError(f"{request.capsule.short}: not held here, and not described")
+            _refuse_others(descriptor, client)
+            capsule = self._create(descriptor, self._unix_s())
         _refuse_others(capsule.descriptor, client)
+        self._add(capsule, request.offset, request.data)
+        return HolderAnswer(head=capsule.segments.end, offset=capsule.next)
+
+    def _add(self, capsule: StoredCapsule, offset: int, data: bytes) -> None:
         if capsule.damage:
             raise LocalError(f"{capsule.name.short}: damaged here ({capsule.damage}); see gdp store verify")
-        segments, data = capsule.segments, request.data
-        behind = request.offset - capsule.next
+        segments, rest = capsule.segments, capsule.rest
+        behind = offset - capsule.next
         if behind < 0:  # it came before, at least in part
-            in_rest = request.offset - segments.end
-            known = capsule.rest[in_rest:] if in_rest >= 0 else segments.read(request.offset, len(data))[1]
-            if not data.startswith(known[: len(data)]):
-                raise LocalError(f"{capsule.name.short}: other bytes are at {request.offset} here: a fork")
+            known, come = rest[max(offset - segments.end, 0) :], data[max(segments.end - offset, 0) :]
+            if not segments.has(offset, data) or not known.startswith(come[: len(known)]):
+                raise LocalError(f"{capsule.name.short}: other bytes are at {offset} here: a fork")
             data = data[-behind:]
         if data:
-            self._refuse_above_quota(capsule, len(data))
-            self._extend(capsule, data, request.offset if behind > 0 else None)
+            self._refuse_above_quota(capsule.parties, capsule, len(data))
+            self._extend(capsule, data, offset if behind > 0 else None)
             self._retire(capsule)
-        return HolderAnswer(head=segments.end, offset=capsule.next)
 
     def _extend(self, capsule: StoredCapsule, data: bytes, gap_end: int | None) -> None:
         """Verify and write the records that are complete with these bytes.
@@ -223,7 +337,7 @@ class CapsuleStore(ClosedOnExit):
         come = data if gap_end is not None else capsule.rest + data
         begin = segments.end if gap_end is None else gap_end
         files, at = [0], 0  # where files begin in ``come``
-        found = list[tuple[int, Record, bytes]]()
+        found = list[IndexedRecord]()
         file_at = segments.last - begin if gap_end is None and segments.offsets else 0
         for wire in split(come):
             record = chain.handle_record(wire, may_skip=gap_end is not None and not at)
@@ -240,30 +354,30 @@ class CapsuleStore(ClosedOnExit):
             if end > first:
                 segments.append(come[first:end], at=begin + first if is_new else None)
         capsule.chain, capsule.rest = chain, come[at:]
-        self._put(capsule.name, found)
+        self._put(capsule, found)
 
-    def _create(self, request: HolderRequest, client: Name) -> StoredCapsule:
-        descriptor = request.descriptor
-        if descriptor is None or descriptor.name != request.capsule:
-            raise LocalError(f"{request.capsule.short}: not held here, and not described")
-        _refuse_others(descriptor, client)
-        descriptor.check_right(self._unix_s())
+    def _create(self, descriptor: Descriptor, unix_s: float) -> StoredCapsule:
+        descriptor.check_right(unix_s)
+        self._refuse_above_quota(_parties_of(descriptor), None, 0)
         place = self.folder / descriptor.name.to_text()
         write_all(place, {DESCRIPTOR: private(descriptor.to_cbor())}, force=True)
         capsule = self._capsules[descriptor.name] = StoredCapsule(place, self._limits.spare_bytes)
         log.info("capsule begun name=%s topic=%s", capsule.name.short, descriptor.topic.name.short)
         return capsule
 
-    def _refuse_above_quota(self, capsule: StoredCapsule, more: int) -> None:
+    def _refuse_above_quota(self, parties: tuple[bytes, bytes], begun: StoredCapsule | None, more: int) -> None:
         if sum(len(each.rest) for each in self._capsules.values()) > _RESTS_MAX_BYTES:
             raise StoreError("too many records are incomplete here; try again")
-        used = sum(each.segments.held_bytes for each in self._capsules.values() if each.owner == capsule.owner)
-        if used + more > self._limits.owner_bytes:
-            most = self._limits.owner_bytes
-            raise StoreError(f"the topics' owner has {used} bytes here, of {most}: remove capsules, or raise the quota")
+        most = self._limits.owner_bytes
+        for at, party in enumerate(parties):
+            found = [each for each in self._capsules.values() if each.parties[at] == party]
+            used = sum(max(each.segments.held_bytes, CHECKPOINT_BYTES) for each in found if each is not begun)
+            held = 0 if begun is None else begun.segments.held_bytes
+            if used + max(held + more, CHECKPOINT_BYTES) > most:
+                whose = f"the {_PARTIES[at]} has {used + held} bytes here, of {most}"
+                raise StoreError(f"{whose}: remove capsules, or raise the quota")
 
     def _retire(self, capsule: StoredCapsule) -> None:
-        """Drop the oldest segments beyond the limits; the last one stays."""
         segments, limits = capsule.segments, self._limits
         before = segments.begin
         while len(segments.offsets) > 1:
@@ -287,33 +401,45 @@ class CapsuleStore(ClosedOnExit):
             ).fetchone()
         return row is not None and row[0] < (self._unix_s() - self._limits.age_s) * 1e9
 
-    def _index_missing(self, capsule: StoredCapsule) -> None:
-        """Index the segments from the last one that is indexed on."""
+    def _resume(self, capsule: StoredCapsule) -> None:
+        """Read the last segment, and those before it from the last one that is indexed on; index them."""
+        segments = capsule.segments
         with self._index.reading() as index:
             (last,) = index.execute("SELECT max(offset) FROM checkpoints WHERE capsule = ?", (capsule.name,)).fetchone()
-        for offset in capsule.segments.offsets:
-            size = capsule.segments.size_of(offset)
+        capsule.chain, found = replayed(capsule.descriptor, segments)
+        capsule.damage = ""
+        for offset in segments.offsets[:-1]:
+            size = segments.size_of(offset)
             if last is not None and offset + size <= last:
                 continue
-            found, at = list[tuple[int, Record, bytes]](), offset
-            for wire in split(capsule.segments.read(offset, size)[1]):
-                record = Record.from_wire(wire)
-                if record.type is not RecordType.MESSAGE:
-                    found.append((at, record, wire))
-                at += len(wire)
-            self._put(capsule.name, found)
+            self._index_records(capsule, offset, segments.read(offset, size)[1])
+        self._put(capsule, found)
 
-    def _put(self, capsule: Name, found: list[tuple[int, Record, bytes]]) -> None:
+    def _index_records(self, capsule: StoredCapsule, at: int, data: bytes) -> None:
+        found = list[IndexedRecord]()
+        for wire in split(data):
+            record = Record.from_wire(wire)
+            if record.type is not RecordType.MESSAGE:
+                found.append((at, record, wire))
+            at += len(wire)
+        self._put(capsule, found)
+
+    def _put(self, capsule: StoredCapsule, found: Sequence[IndexedRecord]) -> None:
         """Index checkpoints, by their offsets, and descriptions and marks, which outlive their segment."""
         if not found:
             return
-        places = [(capsule, at, of.number, of.time_ns) for at, of, _ in found if of.type is RecordType.CHECKPOINT]
-        described = [(capsule, of.number, wire) for _, of, wire in found if of.type is RecordType.DESCRIPTION]
-        marks = [(capsule, of.number, wire) for _, of, wire in found if of.type is RecordType.MARK]
+        name, checkpoints = capsule.name, [(at, of) for at, of, _ in found if of.type is RecordType.CHECKPOINT]
+        described = [(name, of.number, wire) for _, of, wire in found if of.type is RecordType.DESCRIPTION]
+        marks = [(name, of.number, wire) for _, of, wire in found if of.type is RecordType.MARK]
         with self._index.writing() as index:
+            places = [(name, at, each.number, each.time_ns) for at, each in checkpoints]
             index.executemany("INSERT OR REPLACE INTO checkpoints VALUES (?, ?, ?, ?)", places)
             index.executemany("INSERT OR REPLACE INTO descriptions VALUES (?, ?, ?)", described)
             index.executemany("INSERT OR REPLACE INTO marks VALUES (?, ?, ?)", marks)
+        if checkpoints:
+            capsule.checkpoint = max(capsule.checkpoint, checkpoints[-1][0])
+            rank = capsule.checkpoint << _HEAD_BITS | int.from_bytes(capsule.chain.proven, "big") >> 256 - _HEAD_BITS
+            self.heads.put(name, rank)
 
 
 def _marks(index: TransactionFile, name: Name) -> list[bytes]:
@@ -329,6 +455,10 @@ def marks_of(folder: Path, name: Name) -> list[Record]:
     """Return the latest marks of a capsule in a store. Raises ``StoreError``: the index cannot be read."""
     with TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL") as index:
         return [Record.from_wire(wire) for wire in _marks(index, name)]
+
+
+def _parties_of(descriptor: Descriptor) -> tuple[bytes, bytes]:
+    return descriptor.topic.owner_key, descriptor.writer.name
 
 
 def _refuse_others(descriptor: Descriptor, client: Name) -> None:

@@ -14,6 +14,7 @@ from typing import Final
 
 from gdp.closing import ClosedOnExit
 from gdp.errors import StoreError
+from gdp.stores.files import private, write_all
 
 SEGMENT_BYTES: Final = 64 << 20  # after which the next checkpoint begins a file
 _SUFFIX: Final = ".records"
@@ -69,8 +70,8 @@ class Segments(ClosedOnExit):
         return sum(self._sizes.values())
 
     def size_of(self, offset: int) -> int:
-        """Return the bytes of the file that begins at an offset."""
-        return self._sizes[offset]
+        """Return the bytes of the file that begins at an offset; 0: there is none."""
+        return self._sizes.get(offset, 0)
 
     def append(self, data: bytes, *, at: int | None = None) -> None:
         """Append bytes, and put them on the disk.
@@ -115,6 +116,29 @@ class Segments(ClosedOnExit):
                 return offset, file.read(most)
         except OSError as error:
             raise StoreError(f"{self.folder}: {error.strerror}") from error
+
+    def has(self, offset: int, data: bytes) -> bool:
+        """Return whether what is here from an offset on is the same, as far as something is here."""
+        end = offset + len(data)
+        at = offset
+        while at < end:
+            begin, known = self.read(at, end - at)
+            if not known or begin >= end:
+                return True
+            if data[begin - offset :][: len(known)] != known[: end - begin]:
+                return False
+            at = begin + len(known)
+        return True
+
+    def replace(self, offset: int, data: bytes) -> None:
+        """Replace or add the file that begins at an offset, whole or not at all.
+
+        Raises:
+            LocalError: the system refuses.
+        """
+        self.close()
+        write_all(self.folder, {self._path(offset).name: private(data)}, force=True)
+        self._sizes = dict(sorted({**self._sizes, offset: len(data)}.items()))
 
     def cut(self, end: int) -> None:
         """Drop what lies behind an offset within the last file."""

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence, Set
 from typing import NamedTuple
 
+from gdp.capsule.late_join import LateJoin
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Message, Topic
 from gdp.errors import DropReason, LocalError, RemoteError
@@ -75,6 +76,7 @@ class ImportedTopic:
         self._unmatched: Set[str] = frozenset()  # keys of readers whose QoS cannot be met
         self._sources = DecoderCache[tuple[_Decoded, ...]]()
         self.is_joined = False
+        self._past: LateJoin | None = None
         self.local_readers = 0
         self._past_losses = Losses()  # losses of earlier subscriptions
         self._pace = RateLimiter(flow_spec.rule.max_hz)
@@ -104,6 +106,11 @@ class ImportedTopic:
         self._tell_unmatched(ends)
         if ends and not self.is_joined:
             self.is_joined = True
+            keeper, history = self._context.keeper, self._flow_spec.rule.history
+            if history is not None and keeper is not None:
+                self._past = keeper.join(self._flow_spec.local, self._topic, history, self._deliver_past)
+            elif history is not None:
+                self._context.faults.report(self._flow_spec.local, Fault.NOT_KEPT, "no past: restart this proxy")
             paths = paths_value(self._flow_spec.rule.paths)
             self._context.member.subscribe(self._topic, paths=paths, head_bytes=HEAD_BYTES)
         elif not ends and self.is_joined:
@@ -119,6 +126,18 @@ class ImportedTopic:
         self._heard_s[publisher] = now_s
         if len(self._heard_s) > _HEARD_MAX:
             del self._heard_s[next(iter(self._heard_s))]
+        if self._past is not None:
+            self._past.receive_live(message, now_s)
+            self._deliver_past(now_s)
+        else:
+            self._pass(message, now_s)
+
+    def _deliver_past(self, now_s: float) -> None:
+        for message in () if self._past is None else self._past.poll_messages():
+            self._pass(message, now_s)
+
+    def _pass(self, message: Message, now_s: float) -> None:
+        publisher = message.delivered.publisher
         if not self._context.contain(self._flow_spec.local, publisher, now_s, self._receive, message, now_s):
             self.stats.refused += 1
 
@@ -195,6 +214,9 @@ class ImportedTopic:
 
     def _leave(self) -> None:
         self.is_joined = False
+        if self._past is not None and self._context.keeper is not None:
+            self._context.keeper.leave(self._topic.name)
+        self._past = None
         self._past_losses.update(self._context.member.subscriptions.losses_of(self._topic.name))
         self._context.member.unsubscribe(self._topic.name)
 

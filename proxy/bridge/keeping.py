@@ -7,22 +7,40 @@ from __future__ import annotations
 
 import secrets
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from gdp.capsule.holder import HolderAnswer
+from gdp.capsule.late_join import LateJoin
 from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.crypto.identity import Identity
+from gdp.due_queue import earliest
 from gdp.errors import GdpError, LocalError, StoreError
+from gdp.intervals import PACE_S
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.sansio import Timestamps
 from gdp.session.keeping import CapsuleKeeper
+from gdp.session.protocol.client_core import Call
 from gdp.trust.right import Right
 from proxy.bridge.faults import Fault, Faults
+from proxy.config.history import History
 from proxy.config.keep import UPLINK_LOST, Keep
 
 _EVENTS: Final = (UPLINK_LOST, *(each.value for each in Fault if each is not Fault.NOT_KEPT))
+
+
+@dataclass(slots=True)
+class _Joining:
+    local: str
+    join: LateJoin
+    store: str
+    deliver: Callable[[float], None]
+    call: Call | None = None
+    due_s: float = 0.0
 
 
 class TopicKeeper:
@@ -44,6 +62,7 @@ class TopicKeeper:
         self._when: dict[str, set[Name]] = {}  # topics that each event marks
         self._fault_counts: dict[str, int] = {}
         self._was_attached = False
+        self._joins: dict[Name, _Joining] = {}
         self.capsules = CapsuleKeeper(member, identity, folder, start=secrets.randbits(63))
 
     def keep(self, local: str, topic: Topic, publisher: Publisher, keep: Keep, unix_s: float) -> str:
@@ -54,7 +73,8 @@ class TopicKeeper:
                 if not event.startswith("/") and event not in _EVENTS:
                     raise LocalError(f"keep: when: {event} is no event; expected a topic or {', '.join(_EVENTS)}")
                 self._when.setdefault(event, set()).add(topic.name)
-            self.capsules.keep(topic, publisher, self._holder(keep.to), keep.disk, unix_s, keep.around_ns)
+            holders = [self._holder(each) for each in keep.to]
+            self.capsules.keep(topic, publisher, holders, keep.disk, unix_s, keep.around_ns)
         except GdpError as error:
             return str(error)
         return ""
@@ -77,6 +97,32 @@ class TopicKeeper:
             kept.mark(name, int(unix_s * 1e9))
         return len(found)
 
+    def join(self, local: str, topic: Topic, history: History, deliver: Callable[[float], None]) -> LateJoin:
+        """Return a topic's past from a holder, for a reader that joins late; ``deliver`` is called when it has come."""
+        join = LateJoin(topic, time.time(), history.age_s, history.messages, history.max_bytes)
+        self._joins[topic.name] = _Joining(local, join, history.store or "", deliver)
+        return join
+
+    def leave(self, topic: Name) -> None:
+        """Read a topic's past no more."""
+        self._joins.pop(topic, None)
+
+    def _ask(self, joining: _Joining, now_s: float, faults: Faults) -> None:
+        """Ask a holder for the next part of a topic's past."""
+        join, call, joining.due_s = joining.join, joining.call, now_s + PACE_S
+        try:
+            if call is not None and call.is_done:
+                joining.call = None
+                if call.response is None:
+                    raise call.error or LocalError("no answer")
+                join.handle_response(HolderAnswer.from_cbor(call.response.payload), now_s)
+            if joining.call is None and (request := join.next_request(now_s)) is not None:
+                joining.call = self.capsules.ask(self._holder(joining.store), request, now_s)
+        except GdpError as error:
+            join.give_up()
+            faults.report(joining.local, Fault.NOT_KEPT, f"no past from {joining.store}: {error}")
+        joining.deliver(now_s)
+
     def release(self, topic: Name, unix_s: float) -> None:
         """Keep a topic no more."""
         self.capsules.release(topic, unix_s)
@@ -89,6 +135,8 @@ class TopicKeeper:
         """Write and upload what is there, and report what is not kept or not taken by its holder."""
         self._find_events(faults)
         self.capsules.handle(now)
+        for joining in list(self._joins.values()):
+            self._ask(joining, now.mono_s, faults)
         for name, kept in (*self.capsules.topics.items(), *self.capsules.ended.items()):
             for detail in kept.poll_faults():
                 self._failing.add(name)
@@ -109,7 +157,8 @@ class TopicKeeper:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return self.capsules.get_timer()
+        due_s = [each.due_s for each in self._joins.values() if not each.join.is_done]
+        return earliest(self.capsules.get_timer(), *due_s)
 
     def renew(self, held: DelegationStore) -> None:
         """Replace the delegations: new epochs of the holders' services take effect."""

@@ -9,15 +9,16 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timezone
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from gdp.capsule.holder import HolderAnswer, HolderRequest
 from gdp.capsule.opening import NamedMark
 from gdp.cli.node import Config, Json, Logs, MemberPlane, failing_clearly
+from gdp.cli.store import ask
 from gdp.client.participant import Topic
 from gdp.errors import LocalError
 from gdp.session.session import open_session
@@ -101,16 +102,13 @@ def _export(
 ) -> tuple[bool, int]:
     """Write the recording, and report; return whether it has all, and how many messages it has."""
     with open_session(node) as session:
-
-        def ask(request: HolderRequest) -> HolderAnswer:
-            return HolderAnswer.from_cbor(session.call(holder, request.to_cbor(), replication=1).payload)
-
+        ask_holder = partial(ask, session, holder)
         topics = [session.core.resolve(name, Right.READ) for name in names]
         is_marked = any(text is not None and text.startswith(_MARK) for text in span)
-        marks = [mark for topic in topics for mark in marks_of(ask, topic)] if is_marked else []
+        marks = [mark for topic in topics for mark in marks_of(ask_holder, topic)] if is_marked else []
         from_ns, to_ns = _ns(span[0], 0, marks), _ns(span[1], _END_NS, marks, is_end=True)
         histories = [
-            TopicHistory(ask, topic, _name_of(topic, name), from_ns, to_ns)
+            TopicHistory(ask_holder, topic, _name_of(topic, name), from_ns, to_ns)
             for name, topic in zip(names, topics, strict=True)
         ]
         if not any(each.readers for each in histories):

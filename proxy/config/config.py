@@ -200,7 +200,7 @@ class ProxyConfig(Section):
             (
                 "import",
                 self.imports,
-                dict.fromkeys(("history", "keep", "readiness", "stop", "at_once", "state_node", *REDUCTIONS), "expose"),
+                dict.fromkeys(("keep", "readiness", "stop", "at_once", "state_node", *REDUCTIONS), "expose"),
             ),
         ):
             for index, rule in enumerate(rules):
@@ -208,6 +208,8 @@ class ProxyConfig(Section):
                     yield (side, index, key), f"this stands in rules under {only[key]}"
                 if rule.state_node is not None and not rule.is_ordered:
                     yield (side, index, "state_node"), "this needs 'state: ordered'"
+                if rule.history is not None and (rule.history.store is not None) != (side == "import"):
+                    yield (side, index, "history"), "under import this has a 'store', under expose none"
                 if rule.keep is not None and self.state is None:
                     yield (side, index, "keep"), "this needs 'state: FOLDER' of the file"
                 for event in () if rule.keep is None else rule.keep.when:

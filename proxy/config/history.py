@@ -1,4 +1,4 @@
-"""History of a rule: what a publisher keeps for late joiners, by messages, bytes and age.
+"""History of a rule: what a publisher keeps for late joiners, or an importer asks a holder for.
 
 Section of a configuration file.
 """
@@ -22,17 +22,21 @@ class History(Section):
     max_bytes: int = Field(
         default=8 << 20, alias="bytes", ge=1, le=HISTORY_BYTES_MAX, description="Most bytes, as they travel."
     )
+    store: str | None = Field(default=None, min_length=1, description="Imported topics: service of a holder.")
     age_s: float | None = Field(default=None, gt=0, le=DAY_S, description="Longest time in seconds. `null`: any.")
 
 
 def _history(value: object) -> object:
+    if value == "from-store":
+        return {"store": "store"}
     return {"messages": value} if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 def _or_count(schema: JsonDict) -> None:
     forms = schema.get("anyOf")
     if isinstance(forms, list):
-        schema["anyOf"] = [{"type": "integer", "minimum": 1, "maximum": HISTORY_MESSAGES_MAX}, *forms]
+        count: JsonDict = {"type": "integer", "minimum": 1, "maximum": HISTORY_MESSAGES_MAX}
+        schema["anyOf"] = [count, {"const": "from-store"}, *forms]
 
 
 SomeHistory = Annotated[History | None, BeforeValidator(_history), Field(json_schema_extra=_or_count)]

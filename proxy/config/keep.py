@@ -67,7 +67,14 @@ class Keep(Section):
         default=(),
         description="Events: a message of a topic that a rule names (`/estop`), `uplink-lost`, or a fault's word.",
     )
-    to: str = Field(min_length=1, description="The holder's service, as `gdp delegate` named it, or 64 hex digits.")
+    to: Annotated[
+        tuple[Annotated[str, Field(min_length=1)], ...],
+        BeforeValidator(_listed),
+        WithJsonSchema({"anyOf": [{"type": "string", "minLength": 1}, {"type": "array", "items": {"type": "string"}}]}),
+    ] = Field(
+        min_length=1,
+        description="The holder's service, as `gdp delegate` named it, or 64 hex digits; or a list: each holds all.",
+    )
 
     @property
     def around_ns(self) -> tuple[int, int] | None:

@@ -261,7 +261,8 @@ class Rule(Section):
         default=None, description="Imported topics: QoS until a publisher is known; by `gdp import`, or by hand."
     )
     history: SomeHistory = Field(
-        default=None, description="Exposed topics: what is kept for late joiners; a number: messages."
+        default=None,
+        description="What is kept for late joiners; a number: messages. Imported topics: `from-store`, or a `store`.",
     )
     keep: Keep | None = Field(
         default=None, description="Exposed topics: a capsule of all messages, here and at a holder; needs `state`."

@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
 from gdp.capsule.opening import CapsuleOpener, Kept, NamedMark
-from gdp.capsule.reading import CapsuleReader
+from gdp.capsule.reading import CapsuleReader, given
 from gdp.capsule.record import Record, split
 from gdp.client.participant import Topic
 from gdp.errors import GdpError
@@ -55,9 +54,7 @@ class TopicHistory:
         self._ask = ask
         self.name = name
         found = ask(HolderRequest(ask=Ask.LIST, topic=topic.name)).descriptors
-        self.readers = [
-            CapsuleReader(each, topic.secrets, from_ns=from_ns, to_ns=to_ns) for each in found if _is_given(each)
-        ]
+        self.readers = [CapsuleReader(each, topic.secrets, from_ns=from_ns, to_ns=to_ns) for each in given(found)]
         self.unreadable: dict[str, int] = {}
 
     def messages(self) -> Iterator[PastMessage]:
@@ -112,12 +109,3 @@ def merged(histories: Iterable[TopicHistory]) -> Iterator[PastMessage]:
 
 def _stamp(message: PastMessage) -> int:
     return message.stamp_ns
-
-
-def _is_given(descriptor: Descriptor) -> bool:
-    """Return whether the topic's owner let the writer publish it when the capsule began."""
-    try:
-        descriptor.check_right(descriptor.begun_ms / 1e3)
-    except GdpError:
-        return False
-    return True

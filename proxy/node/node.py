@@ -8,6 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
@@ -84,9 +85,10 @@ class ProxyNode(Node):
 
     def open_keeper(self, settings: ProxyConfig, held: DelegationStore) -> TopicKeeper | None:
         """Return the keeper of the rules' topics; None: no rule has one."""
-        if settings.state is None or not any(rule.keep for rule in settings.expose):
+        if not any(rule.keep for rule in settings.expose) and not any(rule.history for rule in settings.imports):
             return None
-        return TopicKeeper(self.member, self.identity, settings.state / CAPSULES, held)
+        folder = Path() if settings.state is None else settings.state / CAPSULES
+        return TopicKeeper(self.member, self.identity, folder, held)
 
     def leave_soon(self, number: int, frame: FrameType | None) -> None:
         """Handle a SIGUSR1, which wakes the loop."""

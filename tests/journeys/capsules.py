@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
@@ -14,17 +15,23 @@ from gdp.capsule.opening import CapsuleOpener, Kept
 from gdp.capsule.reading import CapsuleReader
 from gdp.capsule.record import Record, split
 from gdp.client.participant import Participant
-from gdp.errors import GdpError
+from gdp.client.send_options import SendOptions
+from gdp.errors import GdpError, StoreError
 from gdp.names import Name
+from gdp.service.replication import Mode, Replication
 from gdp.session.keeping import CapsuleKeeper, KeptTopic
+from gdp.session.protocol.client_core import Call, ClientCore
 from gdp.session.protocol.server_core import ServerCore
 from gdp.stores.capsule_store import CapsuleStore, StoreLimits
+from gdp.stores.holder_exchange import Steps
+from gdp.stores.holder_upkeep import HolderUpkeep
 from gdp.trust.right import Right
 from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow
 
 STORE = "/store"
 _STEP_S = 0.005  # between two turns of work, as a busy loop would have
+BACKGROUND = SendOptions(priority="background")
 LIMITS = StoreLimits(owner_bytes=1 << 30, spare_bytes=0)
 
 
@@ -45,6 +52,9 @@ class Holder:
     """Member that holds capsules.
 
     Attributes:
+        service: its name.
+        peers: services of other holders.
+        faults: what it found wrong.
         lie: changes each answer; None: it tells the truth.
     """
 
@@ -52,15 +62,32 @@ class Holder:
     folder: Path
     label: str = SERVER
     limits: StoreLimits = LIMITS
+    service: str = STORE
+    peers: tuple[str, ...] = ()
     lie: Callable[[HolderRequest, HolderAnswer], HolderAnswer] | None = None
     refusals: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
     store: CapsuleStore = field(init=False)
+    upkeep: HolderUpkeep = field(init=False)
     core: ServerCore = field(init=False)
+    clients: dict[str, ClientCore] = field(default_factory=dict)
+    called: dict[Name, ClientCore] = field(default_factory=dict)
+    exchanges: dict[str, tuple[Steps, Call]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        topic = self.world.topic(STORE, self.member, [Right.SERVE], kind="service")
-        self.core = ServerCore(self.member, topic, start=1, at_once=1)
+        self.join()
         self.open()
+
+    def join(self) -> None:
+        """Serve and call, as a new process does."""
+        topic = self.world.topic(self.service, self.member, [Right.SERVE], kind="service")
+        self.core = ServerCore(self.member, topic, start=1, at_once=1)
+        self.exchanges.clear()
+        for peer in self.peers:
+            called = self.world.topic(peer, self.member, [Right.CALL], kind="service")
+            start = int(self.world.network.now.mono_s * 1e6)
+            self.clients[peer] = ClientCore(self.member, called, peer, start=start, options=BACKGROUND)
+            self.called[called.name] = self.clients[peer]
 
     @property
     def member(self) -> Participant:
@@ -69,12 +96,49 @@ class Holder:
     def open(self) -> None:
         """Open the store, as after a restart."""
         self.store = CapsuleStore(self.folder, self.limits, lambda: self.world.network.now.unix_s)
+        self.upkeep = HolderUpkeep(self.store, self.peers, self.world.network.now.mono_s)
+
+    def restart(self, *, has_disk: bool = True) -> None:
+        """End the process, and begin another one; without its disk, it has nothing."""
+        self.store.close()
+        if not has_disk:
+            shutil.rmtree(self.folder)
+        self.world.restart_member(self.label)
+        self.join()
+        self.open()
+
+    def exchange(self, now_s: float) -> None:
+        """Fetch what other holders have."""
+        for peer, client in self.clients.items():
+            due_s = client.get_timer()
+            if due_s is not None and now_s >= due_s:
+                client.handle_timer(now_s)
+            if peer in self.exchanges and self.exchanges[peer][1].is_done:
+                steps, call = self.exchanges.pop(peer)
+                if call.response is not None:
+                    self._step(peer, steps, HolderAnswer.from_cbor(call.response.payload), now_s)
+        for peer, steps in self.upkeep.handle_timer(now_s):
+            self._step(peer, steps, None, now_s)
+        self.faults += self.store.poll_faults().values()
+
+    def _step(self, peer: str, steps: Steps, answer: HolderAnswer | None, now_s: float) -> None:
+        try:
+            request = next(steps) if answer is None else steps.send(answer)
+        except StopIteration:
+            self.upkeep.ended(peer, now_s)
+            return
+        except StoreError:
+            return  # the pause grows
+        call = Call(payload=request.to_cbor(), timeout_s=5.0, replication=Replication(Mode.SOME, copies=1))
+        self.clients[peer].begin(call, now_s)
+        self.exchanges[peer] = steps, call
 
     def work(self) -> None:
         """Answer the requests that have come."""
         now_s = self.world.network.now.mono_s
         for message in self.member.poll_messages():
-            self.core.receive(message, now_s)
+            self.called.get(message.topic, self.core).receive(message, now_s)
+        self.exchange(now_s)
         due_s = self.core.get_timer()
         if due_s is not None and now_s >= due_s:
             self.core.handle_timer(now_s)
@@ -102,19 +166,21 @@ class Keeping:
     flow: Flow
     folder: Path
     most_bytes: int = 1 << 24
+    holders: tuple[str, ...] = (STORE,)
     around_ns: tuple[int, int] | None = None
     keeper: CapsuleKeeper = field(init=False)
     kept: KeptTopic = field(init=False)
+    step_s: float = _STEP_S
     worked_s: float = 0.0
 
     def __post_init__(self) -> None:
         world, member = self.flow.world, self.flow.member
         identity = next(each for each in world.identities.values() if each.name == member.name)
         self.keeper = CapsuleKeeper(member, identity, self.folder, start=7, pool=Inline())
-        service = world.topic(STORE, member, [Right.CALL], kind="service")
+        services = [world.topic(each, member, [Right.CALL], kind="service") for each in self.holders]
         unix_s = world.network.now.unix_s
         self.kept = self.keeper.keep(
-            self.flow.topic, self.flow.publisher, service, self.most_bytes, unix_s, self.around_ns
+            self.flow.topic, self.flow.publisher, services, self.most_bytes, unix_s, self.around_ns
         )
 
     def work(self) -> None:
@@ -133,7 +199,7 @@ class Keeping:
 
         def step() -> bool:
             now_s = world.network.now.mono_s
-            if now_s - self.worked_s < _STEP_S:
+            if now_s - self.worked_s < self.step_s:
                 return False
             self.worked_s = now_s
             self.work()

@@ -41,7 +41,9 @@ class Recorded:
 
     def begin(self) -> None:
         """Begin to keep, as after a start."""
-        keeping = Keeping(advertise(self.world), self.folder / "robot", self.most_bytes, (BEFORE_NS, AFTER_NS))
+        keeping = Keeping(
+            advertise(self.world), self.folder / "robot", self.most_bytes, around_ns=(BEFORE_NS, AFTER_NS)
+        )
         self.keeping, append = keeping, keeping.kept.ring.append
 
         def note(data: bytes, *, begins_file: bool) -> None:

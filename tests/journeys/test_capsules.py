@@ -98,6 +98,17 @@ def test_nothing_is_readable_at_the_holder_before_a_grant(tmp_path: Path) -> Non
     assert sum(opener.closed.values()) > 0
 
 
+def test_what_was_published_a_moment_ago_is_not_uploaded(tmp_path: Path) -> None:
+    keeping, holder = holding(tmp_path)
+    keeping.run(8, holder)
+    assert keeping.kept.is_uploaded
+    keeping.flow.publish(b"now")
+    assert not keeping.kept.is_uploaded
+    assert keeping.run(5, holder, until=lambda: keeping.kept.is_uploaded)
+    kept = opened(records_at(holder.store, keeping.kept.name), keeping)
+    assert [each.message for each in kept] == [b"now"]
+
+
 def test_a_restarted_holder_goes_on_where_it_confirmed(tmp_path: Path) -> None:
     keeping, holder = holding(tmp_path)
     sent = keeping.publish_at([0.05 * each for each in range(160)], lambda each: bytes(3_000) + b"%d" % each)

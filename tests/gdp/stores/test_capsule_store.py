@@ -21,11 +21,12 @@ from gdp.errors import GdpError, LocalError, StoreError
 from gdp.names import Name
 from gdp.stores import capsule_ring, capsule_store
 from gdp.stores.capsule_store import CapsuleStore, StoreLimits, remove, stored
+from gdp.stores.segments import Segments
 from gdp.trust.right import Right
 from tests.gdp.capsule.log import SECOND_NS, Log
 from tests.gdp.capsule.owned import NOW_S, descriptor, writer
 
-LIMITS = StoreLimits(owner_bytes=1 << 20, spare_bytes=0)
+LIMITS = StoreLimits(owner_bytes=1 << 23, spare_bytes=0)
 
 
 def log_of(about: Descriptor | None = None, count: int = 30, size: int = 20) -> Log:
@@ -149,14 +150,35 @@ def test_a_time_is_found_and_the_index_is_made_again_where_it_is_gone(holder: Ho
         holder.restart()
 
 
+def test_a_start_reads_the_last_segment_once_and_no_other_that_is_indexed(
+    holder: Holder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capsule_store, "SEGMENT_BYTES", 4_000)
+    holder.append(b"".join(log_of(count=80).wires), 0)
+    (capsule,) = stored(holder.folder)
+    assert len(capsule.segments.offsets) > 2
+    with mock.patch.object(Segments, "read", autospec=True, side_effect=Segments.read) as read:
+        holder.restart()
+    assert [each.args[1] for each in read.call_args_list] == [capsule.segments.last]
+
+
 def test_an_owner_has_a_quota_for_all_its_topics(tmp_path: Path) -> None:
-    holder = Holder(tmp_path / "store", StoreLimits(owner_bytes=10_000, spare_bytes=0))
-    other = descriptor("/more")
-    holder.append(b"".join(log_of(count=20).wires)[:6_000], 0)
-    with pytest.raises(StoreError, match="quota"):
-        holder.append(b"".join(log_of(other).wires), 0, other)
-    foreign = descriptor("/theirs", which=1)
-    assert holder.append(b"".join(log_of(foreign).wires[:10]), 0, foreign).head > 0
+    holder = Holder(tmp_path / "store", StoreLimits(owner_bytes=3 << 20, spare_bytes=0))
+    large, at = b"".join(log_of(count=80, size=50_000).wires), 0
+    for at in range(0, 3 << 20, 1 << 18):
+        holder.append(large[at : at + (1 << 18)], at)
+    with pytest.raises(StoreError, match=r"topics' owner has .* quota"):
+        holder.append(large[at + (1 << 18) :][: 1 << 18], at + (1 << 18))
+
+
+def test_a_member_that_invents_owners_has_a_quota_too(tmp_path: Path) -> None:
+    holder = Holder(tmp_path / "store", StoreLimits(owner_bytes=3 << 20, spare_bytes=0))
+    for which in range(3):
+        about = descriptor("/mine", which=which)
+        assert holder.append(b"".join(log_of(about).wires[:10]), 0, about).head > 0
+    with pytest.raises(StoreError, match=r"writer has .* quota"):
+        holder.append(b"".join(log_of(descriptor("/mine", which=3)).wires), 0, descriptor("/mine", which=3))
+    assert len(list(stored(holder.folder))) == 3
 
 
 def test_the_oldest_segments_go_by_bytes_and_by_age(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

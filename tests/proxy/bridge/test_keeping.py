@@ -44,7 +44,7 @@ def test_what_is_not_kept_is_a_fault_until_the_holder_has_all(tmp_path: Path) ->
     )
     topic: Any = SimpleNamespace(name=Name(b"t" * 32))
     publisher: Any = None
-    assert "0 delegations to call store" in keeper.keep("/scan", topic, publisher, Keep(to="store"), 1.0)
+    assert "0 delegations to call store" in keeper.keep("/scan", topic, publisher, Keep(to=("store",)), 1.0)
     capsules = SimpleNamespace(topics={topic.name: kept}, ended={}, handle=lambda _now: None)
     keeper.capsules = cast("CapsuleKeeper", capsules)
     kept.new, kept.uploader.is_refused = ["the quota is full"], True
@@ -75,9 +75,9 @@ def test_a_message_a_lost_uplink_and_a_fault_mark_the_topics_whose_rules_state_t
     publisher: Any = None
     for name, local in topics.items():
         topic: Any = SimpleNamespace(name=name)
-        keeper.keep(local, topic, publisher, Keep(to="store", when=events[local]), 1.0)
+        keeper.keep(local, topic, publisher, Keep(to=("store",), when=events[local]), 1.0)
     assert "sunset is no event" in keeper.keep(
-        "/scan", cast("Any", topic), publisher, Keep(to="store", when=("sunset",)), 1.0
+        "/scan", cast("Any", topic), publisher, Keep(to=("store",), when=("sunset",)), 1.0
     )
 
     def news() -> list[tuple[str, str]]:

@@ -202,6 +202,25 @@ def test_every_error_of_a_file_is_reported_in_its_order(place: Path) -> None:
     assert [line.split(":")[1] for line in reported] == ["7", "8", "9"]
 
 
+def test_a_topic_is_kept_by_one_holder_or_several(place: Path) -> None:
+    (place / "state").mkdir()
+    for to, expected in (("store", ("store",)), ("[store-a, store-b]", ("store-a", "store-b"))):
+        text = f"{THREE}state: state\nexpose:\n{rules(f'name: /a, ros: 1, keep: {{to: {to}}}')}"
+        (rule,) = proxy(place, text).expose
+        assert rule.keep is not None
+        assert rule.keep.to == expected
+    assert "keep.to" in refusal(place, text.replace("[store-a, store-b]", "[]"))
+
+
+@pytest.mark.parametrize(("side", "history"), [("expose", "from-store"), ("import", "10")])
+def test_the_past_comes_from_a_store_to_importers_alone(place: Path, side: str, history: str) -> None:
+    text = f"ros: {{endpoint: ros2, domain: 0}}\n{side}:\n{rules(f'name: /a, history: {history}')}"
+    assert f": {side}[0].history: under import this has a 'store', under expose none" in refusal(place, text)
+    other = {"expose": "10", "import": "{store: holders, age_s: 60}"}[side]
+    config = proxy(place, text.replace(history, other))
+    assert len([*config.expose, *config.imports]) == 1
+
+
 @pytest.mark.parametrize(
     ("side", "keys", "complaint"),
     [

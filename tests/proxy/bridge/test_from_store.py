@@ -1,0 +1,54 @@
+"""`history: from-store`: a local reader that comes late gets from a holder what the publisher's memory has no more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from gdp.nodes.delegation_store import DelegationStore
+from gdp.session.keeping import CapsuleKeeper
+from gdp.trust.right import Right
+from proxy.bridge.exposed_topic import ExposedTopic
+from proxy.bridge.keeping import TopicKeeper
+from proxy.config.keep import Keep
+from tests.journeys.capsules import Holder, Inline
+from tests.proxy.bridge import known
+from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Granted, Machine, Sites
+
+COUNT = 60
+
+
+def keeper_of(sites: Sites, machine: Machine, folder: Path) -> TopicKeeper:
+    """Give a machine a keeper, with a delegation to call the holder."""
+    identity = next(each for each in sites.world.identities.values() if each.name == machine.member.name)
+    service = sites.world.topic("store", machine.member, [Right.CALL], kind="service")
+    held: DelegationStore = Granted(folder, [service])
+    keeper = TopicKeeper(machine.member, identity, folder, held)
+    keeper.capsules = CapsuleKeeper(machine.member, identity, folder, start=7, pool=Inline())
+    machine.context = machine.bridge._context = replace(machine.context, keeper=keeper)
+    return keeper
+
+
+def test_a_late_reader_gets_the_past_from_a_holder_then_what_is_live(tmp_path: Path) -> None:
+    sites = Sites(tmp_path)
+    sites.world.add_member("nuc3/holder", "nuc3")
+    robot = sites.add(ROBOT, expose=[f"name: /chatter, type: {known.STRING}, reliable: true, latched: false"])
+    server = sites.add(SERVER, imports=[f"name: /chatter, type: {known.STRING}, history: from-store"])
+    holder = Holder(sites.world, tmp_path / "holder", "nuc3/holder", service="store")
+    keeper = keeper_of(sites, robot, tmp_path / "robot")
+    keeper_of(sites, server, tmp_path / "server")
+    sites.every(0.05, 600, lambda _: holder.work())
+    talker = robot.graph.publish("/talker", "/chatter", known.STRING)
+    assert sites.run(5, lambda: any(isinstance(flow, ExposedTopic) for _, flow in robot.bridge.flows))
+    (flow,) = [flow for _, flow in robot.bridge.flows if isinstance(flow, ExposedTopic)]
+    assert flow.publisher is not None
+    unix_s = sites.world.network.now.unix_s
+    assert keeper.keep("/chatter", flow._topic, flow.publisher, Keep(to=("store",)), unix_s) == ""
+    for number in range(COUNT):
+        sites.world.network.call(0.1 * number, partial(talker.publish, known.string(str(number))))
+    sites.run(4)
+    ear = Ear(server.graph, "/chatter")
+    assert sites.run(20, lambda: len(ear.texts) >= COUNT)
+    assert ear.texts == [str(number) for number in range(COUNT)]
+    assert server.faults == {}
