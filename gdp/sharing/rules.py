@@ -125,11 +125,13 @@ def render(folder: StateFolder, files: ProxyFiles, state: ShareState, used: Iter
         lines["expose"].append(_line(folder, files, each.kind, each.name, each.type_name, owner, more))
     for side, offer in used:
         is_brought = offer.node and not any(offer.fits(each) for each in state.accepted)
-        if not is_brought and files.find(side, offer.kind, offer.ros_name) is None:
+        for name in () if is_brought else offer.names_for(state.accepted):
+            if files.find(side, offer.kind, name) is not None:
+                continue
             more = _metadata(offer.more_metadata)
             if offer.qos is not None and side == "import" and offer.kind == "topic":
                 more["offered"] = offer.qos.model_dump()
-            lines[side].append(_line(folder, files, offer.kind, offer.ros_name, offer.type_name, offer.owner, more))
+            lines[side].append(_line(folder, files, offer.kind, name, offer.type_name, offer.owner, more))
     sides = [f"{side}:\n{''.join(rules)}" for side, rules in lines.items() if rules]
     return _HEAD + "".join(sides) if sides else None
 
