@@ -2,9 +2,9 @@
 
 I/O: endpoint and participant; ``gdp/service/dispatch.py`` or ``gdp/service/sequencer.py`` decide. The virtual server
 exists while a remote one is reachable, so that local clients see whether there is one. That of a far node of a pattern
-exists while the node does: it joins the service when it has a request, which then waits for a server. A call ends with the first
-response, with a reason, or when its time is up. A later response is counted, and servers that still work on the call
-get a cancellation.
+exists while the node does: it joins the service when it has a request, which then waits for a server. A call ends with
+the first response, with a reason, or when its time is up. A later response is counted, and servers that still work on
+the call get a cancellation.
 
 It combines ``server_discovery.py`` (the servers), ``request_sender.py`` (the requests to each of them) and
 ``virtual_server.py`` (what local clients see).
@@ -208,6 +208,7 @@ class ImportedService(ServiceFlow):
         """Close the virtual server; calls under way fail."""
         del now_s
         for event in self._held:
+            self.report(Fault.NO_SERVER, SERVER_GONE)
             self._virtual_server.refuse(event.handle, event.ticket, SERVER_GONE)
         self._shut("the proxy no longer carries this service")
         self._virtual_server.close_now()

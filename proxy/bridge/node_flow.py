@@ -110,10 +110,12 @@ class ExposedNodes(NodeFlow):
             self._publisher.publish(change.to_cbor())
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Send the whole state to a client that asks for it."""
+        """Send the whole state to a client that asks this server for it."""
         del now_s
+        member, client = self.context.member, Name(message.delivered.publisher)
+        if message.delivered.message != member.name:
+            return
         try:
-            member, client = self.context.member, Name(message.delivered.publisher)
             member.services.respond(self.name, client, self._state.whole().to_cbor())
         except LocalError as error:
             self.report(Fault.REFUSED, str(error))  # the client repeats itself
@@ -183,7 +185,7 @@ class ImportedNodes(NodeFlow):
         self.context.contain(self.flow_spec.local, delivered.publisher, now_s, self._receive, message)
 
     def tick(self, now_s: float) -> None:
-        """Compare the machines that describe nodes with those that report now, and what is known of each with its digest."""
+        """Compare what is known of each machine that reports with its digest."""
         for node in self._marks.keys() - self.nodes.keys():  # they no longer appear
             self.dispatcher.close(self._marks.pop(node))
         connected = {each.publisher for each in self.context.member.subscriptions.writer_proxies_of(self.name)}
@@ -197,7 +199,7 @@ class ImportedNodes(NodeFlow):
             self.context.contain(self.flow_spec.local, each.publisher, now_s, self._compare, *args)
         for party in self._asks.poll_due(now_s):
             self._asks.sent(party, now_s, _ASKS)
-            self.context.member.services.send_request(self.name, party, NodesWanted().to_cbor())
+            self._publisher.publish(party)
         shown = tuple(state.digest for state in self._present)
         if shown != self._shown:
             self._shown, self._has_changed = shown, True

@@ -46,7 +46,9 @@ class NodeEntry(NamedTuple):
 
 def _apart(form: Form[_T]) -> Form[_T]:
     """Return the form of what travels encoded in itself, so that the whole is decoded in pieces."""
-    return mapped(OCTETS, lambda wire: form.read(decode(wire, _NODE_MAX_BYTES)), lambda value: encode(form.write(value)))
+    return mapped(
+        OCTETS, lambda wire: form.read(decode(wire, _NODE_MAX_BYTES)), lambda value: encode(form.write(value))
+    )
 
 
 _ENTITY: Final = _apart(row(NodeEntity, one_of(Role), TEXT, TEXT, or_empty(QOS, None)))

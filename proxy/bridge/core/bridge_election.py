@@ -68,7 +68,9 @@ def presence_of_nodes(name: Name) -> str:
 
 def attributed(graph: Graph) -> Graph:
     """Return the graph with the entities of far nodes as those of the proxies by which they appear."""
-    proxies = {end.name.removeprefix(_FAR): end.node for end in graph if end.is_proxy and end.name.startswith(f"{_FAR}/")}
+    proxies = {
+        end.name.removeprefix(_FAR): end.node for end in graph if end.is_proxy and end.name.startswith(f"{_FAR}/")
+    }
     return frozenset(replace(end, node=proxies.get(end.node, end.node)) for end in graph) if proxies else graph
 
 

@@ -80,9 +80,9 @@ def exposed(
         brought: the rules of what nodes have; they apply where no other one does.
     """
     by_node = _by_name(brought)
-    of_nodes = {id(rule): rule for rule, _ in nodes_in(rules, graph).values()}
-    for rule in of_nodes.values():  # one for all nodes of a pattern
-        yield FlowSpec(True, rule.local, NODE_TYPE, rule.overlay_name_of(rule.local, NODE_TYPE), rule)
+    of_nodes = {id(each): each for each, _ in nodes_in(rules, graph).values()}
+    for each in of_nodes.values():  # one for all nodes of a pattern
+        yield FlowSpec(True, each.local, NODE_TYPE, each.overlay_name_of(each.local, NODE_TYPE), each)
     for (kind, local), types in _shown(graph, _SHOWS).items():
         fitting = rules if choose(rules, kind, local) is not None else by_node.get((kind, local), ())
         first = choose(fitting, kind, local)
