@@ -3,7 +3,8 @@
 I/O through the overlay's participant. The description lists the nodes' entities, which cross as rules of their own
 (``core/node_rules.py``). All nodes of a rule share one name, so that a graph at rest costs the reports of one service,
 whatever its size. A change is sent at once to all; a client whose digest differs asks for the whole state, as in
-``gdp/exchange`` (Demers et al., 1987). A client describes what it uses, so that nothing else is advertised.
+``gdp/exchange`` (Demers et al., 1987). A client describes what it uses, so that nothing else is advertised. New nodes
+appear one a tick: a node of rclpy with its entities takes tens of milliseconds, in which nothing else is carried.
 """
 
 from __future__ import annotations
@@ -161,7 +162,7 @@ class ImportedNodes(NodeFlow):
         self._states: dict[Name, tuple[int, NodeSet]] = {}  # of each server, in its incarnation
         self._present: list[NodeSet] = []  # of those that report
         self._asks = Requests[Name]()
-        self._shown: tuple[bytes, ...] = ()  # digests of the states that ``nodes`` has
+        self._shown: tuple[bytes, ...] | None = ()  # digests of the states that ``nodes`` has; None: not all of them
         self._marks: dict[str, int] = {}
 
     @property
@@ -173,7 +174,7 @@ class ImportedNodes(NodeFlow):
     def follow(self, rules: Sequence[Rule]) -> None:
         """Update the rules that say which of the nodes appear here."""
         if rules != self._rules:
-            self._rules, self._shown = rules, ()
+            self._rules, self._shown = rules, None
 
     def want(self, names: Iterable[Wanted]) -> None:
         """Tell the servers what is used here."""
@@ -202,8 +203,10 @@ class ImportedNodes(NodeFlow):
             self._publisher.publish(party)
         shown = tuple(state.digest for state in self._present)
         if shown != self._shown:
-            self._shown, self._has_changed = shown, True
-            self.nodes = self._local_nodes()
+            self._has_changed, nodes = True, self._local_nodes()
+            later = sorted(nodes.keys() - self.nodes.keys())[1:]
+            self.nodes = {node: nodes[node] for node in nodes.keys() - set(later)}
+            self._shown = None if later else shown
             for node in self.nodes.keys() - self._marks.keys():
                 self._marks[node] = self._sign(presence_of_node(node))
 
