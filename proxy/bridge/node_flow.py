@@ -27,7 +27,7 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.service_flow import ServiceFlow
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, Role
-from proxy.wire.node import NodeEntity, NodesChange, NodesDigest, NodeSet, NodesWanted, Wanted
+from proxy.wire.node import NODES_MAX, WANTED_MAX, NodeEntity, NodesChange, NodeSet, NodesWanted, Wanted
 
 _ASKS: Final = Backoff(RETRY_S, FORGET_S)  # for the whole state, which a slow path takes long for
 
@@ -98,7 +98,7 @@ class ExposedNodes(NodeFlow):
         self._of_clients: dict[bytes, frozenset[Wanted]] = {}  # by description
         self._state = NodeSet()
         self._state.replace(self._described(nodes))
-        self._publisher = context.member.serve(topic, NodesDigest(self._state.digest).to_cbor(), **self.options())
+        self._publisher = context.member.serve(topic, self._state.digest, **self.options())
 
     def follow(self, nodes: Mapping[str, Sequence[GraphEntity]]) -> None:
         """Send what has changed of the nodes."""
@@ -106,7 +106,7 @@ class ExposedNodes(NodeFlow):
         if described_nodes == self._state.nodes:
             return
         change = self._state.replace(described_nodes)
-        self._publisher.describe(NodesDigest(self._state.digest).to_cbor())
+        self._publisher.describe(self._state.digest)
         if self._publisher.is_wanted and self._publisher.has_space():
             self._publisher.publish(change.to_cbor())
 
@@ -140,7 +140,9 @@ class ExposedNodes(NodeFlow):
 
     def _described(self, nodes: Mapping[str, Sequence[GraphEntity]]) -> dict[str, tuple[NodeEntity, ...]]:
         rule = self.flow_spec.rule
-        return {rule.global_name_of(node): described(rule, ends) for node, ends in nodes.items()}
+        if len(nodes) > NODES_MAX:
+            self.report(Fault.TOO_LARGE, f"{len(nodes)} nodes; a rule brings the first {NODES_MAX}: use several rules")
+        return {rule.global_name_of(node): described(rule, nodes[node]) for node in sorted(nodes)[:NODES_MAX]}
 
 
 class ImportedNodes(NodeFlow):
@@ -178,7 +180,10 @@ class ImportedNodes(NodeFlow):
 
     def want(self, names: Iterable[Wanted]) -> None:
         """Tell the servers what is used here."""
-        self._publisher.describe(NodesWanted(tuple(sorted(names))).to_cbor())
+        wanted = sorted(names)
+        if len(wanted) > WANTED_MAX:
+            self.report(Fault.TOO_LARGE, f"{len(wanted)} names of far nodes are used; the first {WANTED_MAX} cross")
+        self._publisher.describe(NodesWanted(tuple(wanted)).to_cbor())
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a change, or the whole state, of a server's nodes."""
@@ -196,8 +201,10 @@ class ImportedNodes(NodeFlow):
         self._present = []
         for each in self.peers():
             self._present.append(state := self._state_of(each.publisher, each.incarnation))
-            args = each.publisher, state, each.description, now_s
-            self.context.contain(self.flow_spec.local, each.publisher, now_s, self._compare, *args)
+            if each.description == state.digest:
+                self._asks.cancel(each.publisher)
+            elif each.publisher not in self._asks:  # nothing is known, or the change that is announced does not come
+                self._asks.start(each.publisher, now_s + PROMPT_S if state.digest else now_s)
         for party in self._asks.poll_due(now_s):
             self._asks.sent(party, now_s, _ASKS)
             self._publisher.publish(party)
@@ -227,13 +234,6 @@ class ImportedNodes(NodeFlow):
             known = self._states[party] = incarnation, NodeSet()
             self._asks.cancel(party)
         return known[1]
-
-    def _compare(self, party: Name, state: NodeSet, description: bytes, now_s: float) -> None:
-        """Ask for the whole state if nothing is known, or if the change that is announced does not come."""
-        if NodesDigest.from_cbor(description).digest == state.digest:
-            self._asks.cancel(party)
-        elif party not in self._asks:
-            self._asks.start(party, now_s + PROMPT_S if state.digest else now_s)
 
     def _local_nodes(self) -> dict[str, FarNode]:
         found, owner = dict[str, FarNode](), self.flow_spec.rule.owner

@@ -20,7 +20,7 @@ from proxy.serial.channel import QOS, TEXT, Qos
 
 NODES_MAX: Final = 1_000  # of one rule; one decode has at most 2,048 items, and each node is one
 ENTITIES_MAX: Final = 1_024  # of one node, each alike
-_WANTED_MAX: Final = 1_024
+WANTED_MAX: Final = 2_000  # names that one machine uses, each one item, too
 _NODE_MAX_BYTES: Final = 1 << 20
 _DIGEST_BYTES: Final = 16
 
@@ -58,13 +58,6 @@ _DIGEST: Final = octets(_DIGEST_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
-class NodesDigest(FieldSet):
-    """Digest of the state of all nodes."""
-
-    digest: Annotated[bytes, Keyed("d", _DIGEST)]
-
-
-@dataclass(frozen=True, slots=True)
 class NodesChange(FieldSet):
     """Nodes that are new or have changed, and those that are gone; ``before``: digest of the state that it changes."""
 
@@ -79,7 +72,7 @@ class NodesWanted(FieldSet):
     """What a client uses of the nodes now."""
 
     MAX_BYTES = 2 << 20
-    names: Annotated[tuple[Wanted, ...], Keyed("w", many(_WANTED, _WANTED_MAX))] = ()
+    names: Annotated[tuple[Wanted, ...], Keyed("w", many(_WANTED, WANTED_MAX))] = ()
 
 
 class NodeSet:
@@ -97,7 +90,7 @@ class NodeSet:
     def replace(self, nodes: Mapping[str, tuple[NodeEntity, ...]]) -> NodesChange:
         """Replace the state; return the change for who had the one before."""
         before, known = self.digest, self.nodes
-        self.nodes = dict(sorted(nodes.items())[:NODES_MAX])
+        self.nodes = dict(sorted(nodes.items()))
         entries = [NodeEntry(*each) for each in self.nodes.items()]
         self.digest = sha256(encode(NodesChange(b"", tuple(entries)).to_fields())).digest()[:_DIGEST_BYTES]
         changed = tuple(each for each in entries if known.get(each.name) != each.entities)
