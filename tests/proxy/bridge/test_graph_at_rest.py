@@ -15,7 +15,7 @@ from proxy.endpoints.core.endpoint import Graph, Role
 from tests.proxy.bridge.clients import Client
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Sites, named
-from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
+from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph, Publication, Server, Subscription
 
 REST_BITS_S = 50_000
 SHOWN_S = 1.0
@@ -124,7 +124,8 @@ def changes(far: Far, chance: random.Random) -> list[Callable[[], object]]:
     graph, new, old, other = far.robot.graph, f"/n{chance.randrange(100, 999)}", *chance.sample(NODES[1:30], 2)
 
     def end() -> None:
-        for each in [each for each in (*graph.publications, *graph.readers, *graph.servers) if each.end.node == old]:
+        ends: list[Publication | Subscription | Server] = [*graph.publications, *graph.readers, *graph.servers]
+        for each in [each for each in ends if each.end.node == old]:
             each.close()
 
     return [
