@@ -181,9 +181,9 @@ def _route(
 
 def _is_renewal(route: Route, known: Route | Withdrawn | None) -> bool:
     """Return whether an advertisement only extends the lease: those that watch renew their watches, and get it then."""
-    if not isinstance(known, Route) or known.sender != route.sender or known.place != route.place:
+    if not isinstance(known, Route) or known.is_from_upstream:
         return False
-    if known.is_from_upstream != route.is_from_upstream or known.transit != route.transit:
+    if (known.sender, known.place, known.transit) != (route.sender, route.place, route.transit):
         return False
     old, new = (UnverifiedAdvertisement.from_statement(parse(each.advertisement)) for each in (known, route))
     return replace(old, sequence=new.sequence) == new

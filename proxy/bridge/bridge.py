@@ -27,7 +27,7 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, presence_of_nodes, sign
 from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
 from proxy.bridge.core.exclusive_control import ExclusiveControl
-from proxy.bridge.core.node_rules import Brought, FarNodes, brought, nodes_in, of_rule
+from proxy.bridge.core.node_rules import Brought, FarNodes, brought, nodes_in
 from proxy.bridge.core.stream_qos import LiveQos
 from proxy.bridge.core.topic_stats import TopicStats
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -123,7 +123,7 @@ class _View:
 
     def nodes_of(self, rule: Rule) -> Mapping[str, Sequence[GraphEntity]]:
         """Return the local nodes of a rule, with their entities."""
-        return of_rule(rule, self._nodes)
+        return {node: ends for node, (its, ends) in self._nodes.items() if its is rule}
 
 
 class _Signboard:
@@ -331,7 +331,7 @@ class Bridge:
             due_s = flow.get_timer()
             if is_tick:
                 self._context.contain(local, b"", now_s, flow.tick, now_s)
-                self._is_stale |= not isinstance(flow, ExposedService) and flow.poll_changed()
+                self._is_stale |= flow.poll_changed()
             elif due_s is not None and due_s <= now_s:
                 self._context.contain(local, b"", now_s, flow.handle_timer, now_s)
         for topic, local in self._timed_topics.items():
@@ -575,11 +575,7 @@ class Bridge:
 
     def _far(self, at: int) -> FarNodes:
         """Return the far nodes that are described now."""
-        found: dict[str, Graph] = {}
-        for _, flow in self._imported_nodes(at):
-            for node, (_, ends) in flow.nodes.items():
-                found[node] = found.get(node, frozenset()) | ends
-        return found
+        return {node: ends for _, flow in self._imported_nodes(at) for node, (_, ends) in flow.nodes.items()}
 
     def _show(self, at: int, far_nodes: FarNodes) -> None:
         """Have far nodes appear in a graph."""

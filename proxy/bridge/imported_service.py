@@ -120,7 +120,7 @@ class ImportedService(ServiceFlow):
         self._virtual_server = VirtualServer(self)
         self._sender = RequestSender(self, self._calls, self._goals)
         self._discovery = ServerDiscovery(self, self._calls, self._goals, opened=self._open, closed=self._shut)
-        self.is_joined = self._has_changed = False
+        self.is_joined = False
         self._held: list[RequestReceived] = []  # until there is a server
         self._held_until_s = self._used_s = NEVER_S
         self._offered: Exchange | None = None
@@ -183,11 +183,6 @@ class ImportedService(ServiceFlow):
             self._outside = outside
         if self._is_lazy and now_s - self._used_s > FORGET_S and not (self._held or any(map(len, self._calls))):
             self._leave(now_s)
-
-    def poll_changed(self) -> bool:
-        """Return, once, whether it joined the service or left it."""
-        has_changed, self._has_changed = self._has_changed, False
-        return has_changed
 
     def handle_timer(self, now_s: float) -> None:
         """Run due timers between checks of the servers."""
@@ -261,12 +256,12 @@ class ImportedService(ServiceFlow):
         description = b"" if known is None else known.to_cbor()
         self._sender.publisher = self.context.member.call(self.topic, description, **self.options())
         services.paths_for(self.name, self.flow_spec.rule.spread)  # the switch states costs from now on
-        self.is_joined = self._has_changed = True
+        self.is_joined = self.has_changed = True
 
     def _leave(self, now_s: float) -> None:
         """Leave a service that no local node has used for a while."""
         self.context.member.withdraw(self.name)
-        self._sender.publisher, self.is_joined, self._has_changed = None, False, True
+        self._sender.publisher, self.is_joined, self.has_changed = None, False, True
         self._discovery.update(now_s)
 
     def _open(self, ours: Exchange) -> None:

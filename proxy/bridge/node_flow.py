@@ -39,7 +39,6 @@ class NodeFlow(ServiceFlow):
         self, context: BridgeContext, dispatcher: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic
     ) -> None:
         super().__init__(context, dispatcher, flow_spec, topic)
-        self._has_changed = False
         self._mark = self._sign(presence_of_nodes(self.name))
 
     def handle_event(self, event: Event, now_s: float) -> None:
@@ -60,11 +59,6 @@ class NodeFlow(ServiceFlow):
 
     def get_timer(self) -> None:
         """Return None: it has no timer but the tick."""
-
-    def poll_changed(self) -> bool:
-        """Return, once, whether what the bridge does changes."""
-        has_changed, self._has_changed = self._has_changed, False
-        return has_changed
 
     def close(self, now_s: float) -> None:
         """Withdraw the nodes."""
@@ -133,7 +127,7 @@ class ExposedNodes(NodeFlow):
                 self.context.contain(self.flow_spec.local, b"", now_s, self._read, each)
         wanted = frozenset[Wanted]().union(*self._of_clients.values())
         if wanted != self.wanted:
-            self.wanted, self._has_changed = wanted, True
+            self.wanted, self.has_changed = wanted, True
 
     def _read(self, description: bytes) -> None:
         self._of_clients[description] = frozenset(NodesWanted.from_cbor(description).names)
@@ -164,7 +158,8 @@ class ImportedNodes(NodeFlow):
         self._states: dict[Name, tuple[int, NodeSet]] = {}  # of each server, in its incarnation
         self._present: list[NodeSet] = []  # of those that report
         self._asks = Requests[Name]()
-        self._shown: tuple[bytes, ...] | None = ()  # digests of the states that ``nodes`` has; None: not all of them
+        self._shown: tuple[bytes, ...] | None = ()  # digests of the states in ``_found``; None: it is to be made again
+        self._found: Mapping[str, FarNode] = {}  # all of them, also those that do not appear yet
         self._marks: dict[str, int] = {}
 
     @property
@@ -210,11 +205,12 @@ class ImportedNodes(NodeFlow):
             self._publisher.publish(party)
         shown = tuple(state.digest for state in self._present)
         if shown != self._shown:
-            self._has_changed, nodes = True, self._local_nodes()
-            later = sorted(nodes.keys() - self.nodes.keys())[1:]
-            self.nodes = {node: nodes[node] for node in nodes.keys() - set(later)}
-            self._shown = None if later else shown
-            for node in self.nodes.keys() - self._marks.keys():
+            self._shown, self._found = shown, self._local_nodes()
+        later = set(sorted(self._found.keys() - self.nodes.keys())[1:])
+        nodes = {node: each for node, each in self._found.items() if node not in later}
+        if nodes != self.nodes:
+            self.nodes, self.has_changed = nodes, True
+            for node in nodes.keys() - self._marks.keys():
                 self._marks[node] = self._sign(presence_of_node(node))
 
     def close(self, now_s: float) -> None:

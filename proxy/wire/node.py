@@ -100,11 +100,9 @@ class NodeSet:
         """Return the whole state."""
         return NodesChange(b"", tuple(NodeEntry(*each) for each in self.nodes.items()))
 
-    def apply(self, change: NodesChange) -> bool:
-        """Apply a change; return False where it is one of another state."""
-        if change.before not in (b"", self.digest):
-            return False
-        kept = self.nodes if change.before else {}
-        left = {name: entities for name, entities in kept.items() if name not in change.gone}
-        self.replace({**left, **dict(change.nodes)})
-        return True
+    def apply(self, change: NodesChange) -> None:
+        """Apply a change, unless it is one of another state."""
+        if change.before in (b"", self.digest):
+            kept = self.nodes if change.before else {}
+            left = {name: entities for name, entities in kept.items() if name not in change.gone}
+            self.replace({**left, **dict(change.nodes)})

@@ -45,11 +45,6 @@ def nodes_in(rules: Sequence[Rule], graph: Graph) -> dict[str, tuple[Rule, list[
     return found
 
 
-def of_rule(rule: Rule, nodes: Mapping[str, tuple[Rule, list[GraphEntity]]]) -> dict[str, list[GraphEntity]]:
-    """Return those of the nodes that one rule means, with their entities."""
-    return {node: ends for node, (its, ends) in nodes.items() if its is rule}
-
-
 def node_entity(end: GraphEntity) -> GraphEntity:
     """Return the node of an entity, as if it were the server of its own name."""
     return GraphEntity(Role.SERVES, end.node, NODE_TYPE, end.node, end.node)
