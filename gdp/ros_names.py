@@ -79,6 +79,12 @@ def matches(pattern: str, name: str) -> bool:
     return _compiled(pattern).fullmatch(name) is not None
 
 
+def meets(pattern: str, name: str) -> bool:
+    """Return whether a name is meant by a pattern, or another pattern and it mean names in common, as far as seen."""
+    some, other = (each.replace("**", "*").replace("*", "n") for each in (pattern, name))
+    return pattern == name or matches(pattern, other) or (is_pattern(name) and matches(name, some))
+
+
 def is_of_every_node(kind: Kind, name: str) -> bool:
     """Return whether every node has this topic or a service of this last segment, without its author's doing."""
     return (name if kind == "topic" else name.rpartition("/")[2]) in _OF_EVERY_NODE[kind]

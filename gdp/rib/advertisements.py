@@ -46,7 +46,8 @@ def receive_advertisement(
         state.policy.audit.record(Action.ACCEPTED, "name", who=who, about=about)
     key = route.key
     state.outbox.send_ack(key, None, route.sequence, member.name)
-    state.outbox.notify(route, known, now.mono_s)
+    if not _is_renewal(route, known):
+        state.outbox.notify(route, known, now.mono_s)
     state.exchange.push(ROUTES, b"".join(key))
     if route.is_global and not state.upstream.has(member.name):
         _forward(state, route, statement, route.sequence, now.mono_s)
@@ -176,6 +177,16 @@ def _route(
         transit=tuple(sorted(state.policy.transit)) if is_own_switch else relayed.transit,
         expires_s=now.mono_s + min(advertisement.lease_s, left_s),
     )
+
+
+def _is_renewal(route: Route, known: Route | Withdrawn | None) -> bool:
+    """Return whether an advertisement only extends the lease: those that watch renew their watches, and get it then."""
+    if not isinstance(known, Route) or known.is_from_upstream:
+        return False
+    if (known.sender, known.place, known.transit) != (route.sender, route.place, route.transit):
+        return False
+    old, new = (UnverifiedAdvertisement.from_statement(parse(each.advertisement)) for each in (known, route))
+    return replace(old, sequence=new.sequence) == new
 
 
 def _refuse(state: RibCoreState, statement: Statement, member: Membership, error: StatementError, now_s: float) -> None:

@@ -83,7 +83,7 @@ def usable(
 
     Of what an accepted node brings the rights to read and call are used; what leaves a machine is accepted by name.
     """
-    nodes = {(each.sender, each.ros_name) for each in accepted_nodes(state, offers)}
+    nodes = accepted_nodes(state, offers)
     taken = set[tuple[str, str]]()
     for offer in offers:
         if offer.is_withdrawn:
@@ -107,13 +107,14 @@ def usable(
             taken.add(key)
 
 
-def accepted_nodes(state: ShareState, offers: Iterable[Offer]) -> list[Offer]:
-    """Return the offers of nodes that are accepted."""
-    return [
-        each
+def accepted_nodes(state: ShareState, offers: Iterable[Offer]) -> set[tuple[str, str]]:
+    """Return the nodes that are accepted, each with its sender; of a pattern also those that are, by their names."""
+    return {
+        (each.sender, name)
         for each in offers
         if each.kind == "node" and not each.is_withdrawn and any(each.fits(accepted) for accepted in state.accepted)
-    ]
+        for name in (each.ros_name, *each.names_for(state.accepted))
+    }
 
 
 def render(folder: StateFolder, files: ProxyFiles, state: ShareState, used: Iterable[tuple[Side, Offer]]) -> str | None:
@@ -125,11 +126,13 @@ def render(folder: StateFolder, files: ProxyFiles, state: ShareState, used: Iter
         lines["expose"].append(_line(folder, files, each.kind, each.name, each.type_name, owner, more))
     for side, offer in used:
         is_brought = offer.node and not any(offer.fits(each) for each in state.accepted)
-        if not is_brought and files.find(side, offer.kind, offer.ros_name) is None:
+        for name in () if is_brought else offer.names_for(state.accepted):
+            if files.find(side, offer.kind, name) is not None:
+                continue
             more = _metadata(offer.more_metadata)
             if offer.qos is not None and side == "import" and offer.kind == "topic":
                 more["offered"] = offer.qos.model_dump()
-            lines[side].append(_line(folder, files, offer.kind, offer.ros_name, offer.type_name, offer.owner, more))
+            lines[side].append(_line(folder, files, offer.kind, name, offer.type_name, offer.owner, more))
     sides = [f"{side}:\n{''.join(rules)}" for side, rules in lines.items() if rules]
     return _HEAD + "".join(sides) if sides else None
 

@@ -302,7 +302,7 @@ class Sharing:
 
     def _find_brought(self, at: _Pass) -> None:
         """Mark the offers of what accepted nodes have: the live proxy knows it, and lacks their delegations."""
-        nodes = {(each.sender, each.ros_name) for each in accepted_nodes(at.state, at.offers)}
+        nodes = accepted_nodes(at.state, at.offers)
         wanted = {each.name: each.node for each in at.files.live_names().undelegated} if nodes else {}
         for offer in at.offers if wanted else ():
             name = offer.delegation.name

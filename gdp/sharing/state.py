@@ -9,7 +9,7 @@ I/O. The folder ``proxy.yaml.shares`` lies in the folder of ``proxy.yaml`` and b
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -22,7 +22,7 @@ from gdp.crypto.keys import PublicKey
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError, StatementError
 from gdp.names import Name
-from gdp.ros_names import Kind
+from gdp.ros_names import Kind, is_pattern, meets
 from gdp.sharing.proxy_files import Side, fits
 from gdp.stores.files import private, public, read_private, write_all
 from gdp.stores.keyring import load_delegation, save_delegation
@@ -168,9 +168,20 @@ class Offer:
         return PublicKey.from_compressed(self.delegation.subject.owner_key)
 
     def fits(self, accepted: AcceptedName) -> bool:
-        """Return whether an accepted name covers this offer."""
+        """Return whether an accepted name covers this offer, or some of the nodes of a pattern that it offers."""
         is_sender = accepted.source is None or accepted.source == self.sender
-        return is_sender and accepted.side in self.sides and fits(accepted.name, self.ros_name)
+        is_covered = fits(accepted.name, self.ros_name) or (self._is_of_nodes and meets(self.ros_name, accepted.name))
+        return is_sender and accepted.side in self.sides and is_covered
+
+    def names_for(self, accepted: Iterable[AcceptedName]) -> list[str]:
+        """Return the names of the rules that use it: of a pattern of nodes those that are accepted."""
+        names = dict.fromkeys(each.name for each in accepted if self.fits(each))
+        is_whole = not self._is_of_nodes or any(fits(each, self.ros_name) for each in names)
+        return [self.ros_name] if is_whole else list(names)
+
+    @property
+    def _is_of_nodes(self) -> bool:
+        return self.kind == "node" and is_pattern(self.ros_name)
 
     @property
     def _meaning(self) -> dict[str, str | int]:

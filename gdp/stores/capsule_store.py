@@ -214,7 +214,10 @@ class CapsuleStore(ClosedOnExit):
         """
         segments = capsule.segments
         with self._lock:
-            old = segments.read(offset, segments.size_of(offset))[1]
+            try:
+                old = segments.read(offset, segments.size_of(offset))[1]
+            except StoreError:  # the file is gone
+                old = b""
             new = data + old[len(data) :]
             if new == old or (offset not in segments.offsets and offset > segments.begin):
                 return False  # or it was dropped meanwhile

@@ -12,7 +12,7 @@ import logging
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from gdp.client.participant import Message, Topic
@@ -24,10 +24,10 @@ from gdp.nodes.delegation_store import DelegationStore
 from gdp.sansio import Timestamps
 from gdp.trust.right import Right
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, presence_of_node, sign
+from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, presence_of_nodes, sign
 from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
 from proxy.bridge.core.exclusive_control import ExclusiveControl
-from proxy.bridge.core.node_rules import Brought, FarNodes, brought
+from proxy.bridge.core.node_rules import Brought, FarNodes, brought, nodes_in
 from proxy.bridge.core.stream_qos import LiveQos
 from proxy.bridge.core.topic_stats import TopicStats
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -37,11 +37,11 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.bridge.liveliness import NameLiveliness
-from proxy.bridge.node_flow import ExposedNode, ImportedNode
+from proxy.bridge.node_flow import ExposedNodes, ImportedNodes
 from proxy.bridge.readiness import ReadinessProbe
 from proxy.bridge.sent_stats import SentStats
 from proxy.bridge.status_topic import StatusTopic, open_status_topics
-from proxy.config.brought_rule import stated
+from proxy.config.brought_rule import BroughtRule, stated
 from proxy.config.rule import Rule
 from proxy.config.status_topic import StatusTopicConfig
 from proxy.endpoints.core.endpoint import (
@@ -55,6 +55,7 @@ from proxy.endpoints.core.endpoint import (
     proxy_node_name,
 )
 from proxy.serial.channel import Qos
+from proxy.wire.node import Wanted
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +63,8 @@ _ENDED_MAX: Final = 256
 _FINISH_S: Final = 10.0  # in which readers may confirm the last messages of a publisher or server that has gone
 _CHANGES_MAX: Final = 512  # of unread flow changes; a bridge of a recording never reads them
 
-Flow: TypeAlias = ExposedTopic | ImportedTopic | ExposedService | ImportedService | ExposedNode | ImportedNode
+Flow: TypeAlias = ExposedTopic | ImportedTopic | ExposedService | ImportedService | ExposedNodes | ImportedNodes
+_Timed: TypeAlias = ExposedService | ImportedService | ExposedNodes | ImportedNodes
 
 
 class BridgeRules(Protocol):
@@ -106,23 +108,22 @@ class _Key(NamedTuple):
 class _View:
     """Snapshot of one graph."""
 
-    def __init__(self, graph: Graph, me: str) -> None:
+    def __init__(self, graph: Graph, me: str, expose: Sequence[Rule] = ()) -> None:
         self.graph = graph
         self.conflicts = BridgeElection(me, graph)
         self._ends: dict[tuple[Role, str, str], list[GraphEntity]] = {}
-        self._of_node: dict[str, list[GraphEntity]] = {}
         for end in graph:
             if not end.is_proxy:
                 self._ends.setdefault((end.role, end.name, end.type_name), []).append(end)
-                self._of_node.setdefault(end.node, []).append(end)
+        self._nodes = nodes_in(expose, graph)
 
     def ends(self, role: Role, flow_spec: FlowSpec) -> Sequence[GraphEntity]:
         """Return the entities of this role, other than those of proxies, under the flow's local name."""
         return self._ends.get((role, flow_spec.local, flow_spec.type_name), ())
 
-    def of_node(self, flow_spec: FlowSpec) -> Sequence[GraphEntity]:
-        """Return the entities of the local node that is the flow's."""
-        return self._of_node.get(flow_spec.local, ())
+    def nodes_of(self, rule: Rule) -> Mapping[str, Sequence[GraphEntity]]:
+        """Return the local nodes of a rule, with their entities."""
+        return {node: ends for node, (its, ends) in self._nodes.items() if its is rule}
 
 
 class _Signboard:
@@ -167,8 +168,9 @@ class Bridge:
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._finishing: dict[Name, _Finishing] = {}
-        self._timed: dict[ExposedService | ImportedService | ImportedNode, str] = {}  # to its local name
+        self._timed: dict[_Timed, str] = {}  # to its local name
         self._far_nodes: list[FarNodes] = [{} for _ in endpoints]  # by endpoint, as they appear
+        self._wanted = set[Wanted]()  # by far machines, of what local nodes have
         self._timed_topics: dict[ExposedTopic | ImportedTopic, str] = {}  # to their local names
         self._probes: dict[_Key, ReadinessProbe] = {}  # of local servers, whether their flow has begun or not
         self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
@@ -221,8 +223,7 @@ class Bridge:
         """Return the rules of what the nodes have that rules are about."""
         rules = Brought([], [])
         for at, dispatcher in enumerate(self._dispatchers):
-            expose = [rule for rule in self.rules.expose if self.rules.endpoint_of(rule) == at]
-            here = self._brought(at, expose, dispatcher.graph())
+            here = self._brought(at, self._exposed_at(at), dispatcher.graph())
             rules.expose.extend(here.expose)
             rules.imports.extend(here.imports)
         return rules
@@ -330,7 +331,7 @@ class Bridge:
             due_s = flow.get_timer()
             if is_tick:
                 self._context.contain(local, b"", now_s, flow.tick, now_s)
-                self._is_stale |= isinstance(flow, ImportedNode) and flow.poll_changed()
+                self._is_stale |= flow.poll_changed()
             elif due_s is not None and due_s <= now_s:
                 self._context.contain(local, b"", now_s, flow.handle_timer, now_s)
         for topic, local in self._timed_topics.items():
@@ -421,8 +422,9 @@ class Bridge:
         self._is_stale = False
         complaints = list[ConfigProblem]()
         wished, shown = set[_Key](), set[_Key]()
+        self._wanted = {name for flow in self._timed if isinstance(flow, ExposedNodes) for name in flow.wanted}
         for at, dispatcher in enumerate(self._dispatchers):
-            view = _View(dispatcher.graph(), self._me)
+            view = _View(dispatcher.graph(), self._me, self._exposed_at(at))
             far_nodes = self._far(at)
             self._show(at, {**self._far_nodes[at], **far_nodes})  # before what they own
             for flow_spec in self._flow_specs(at, view.graph, complaints):
@@ -443,6 +445,7 @@ class Bridge:
                 self._finish(key)
         for at in range(len(self._dispatchers)):
             self._show(at, self._far(at))
+            self._want(at)
         for key in [key for key in self._probes if key not in wished]:
             self._probes.pop(key).close()
         self._since = {key: since for key, since in self._since.items() if key in wished}
@@ -484,7 +487,10 @@ class Bridge:
         complaints += [self._failed[key]] if key in self._failed else []
 
     def _is_ready(self, key: _Key, flow_spec: FlowSpec, now_s: float) -> bool:
-        """Return whether the local server's probe passes; one without a probe is ready."""
+        """Return whether a far machine wants it, if it must, and the local server's probe passes, if it has one."""
+        if not self._is_wanted(flow_spec):
+            self._may_use(key, flow_spec)
+            return False
         settings = flow_spec.rule.readiness
         probe = self._probes.get(key)
         if probe is not None and probe.settings != settings:
@@ -499,6 +505,28 @@ class Bridge:
                 self._failed[key] = ConfigProblem(flow_spec.local, Fault.UNKNOWN_TYPE, f"readiness: {error}")
                 return False
         return probe.is_ready
+
+    def _is_wanted(self, flow_spec: FlowSpec) -> bool:
+        """Return whether a flow is to exist: what a pattern of local nodes brings does while a far machine uses it."""
+        rule = flow_spec.rule
+        if not isinstance(rule, BroughtRule) or not rule.awaits_demand:
+            return True
+        return (rule.kind, rule.global_name_of(flow_spec.local)) in self._wanted
+
+    def _want(self, at: int) -> None:
+        """State what is used here of the far nodes of patterns."""
+        for _, nodes in self._imported_nodes(at):
+            hears, wanted = nodes.hears, set[Wanted]()
+            rules = {id(rule) for rule, _ in nodes.nodes.values()}
+            for flow_spec, flow in self._flows.values():
+                kind, shared = flow_spec.rule.kind, flow_spec.rule.global_name_of(flow_spec.local)
+                if kind == "node":
+                    continue
+                is_given = isinstance(flow, ExposedTopic) and shared in hears
+                is_taken = isinstance(flow, ImportedTopic | ImportedService) and flow.is_joined
+                if is_given or (is_taken and id(stated(flow_spec.rule)) in rules):
+                    wanted.add((kind, shared))
+            nodes.want(wanted)
 
     def _is_our_turn(self, key: _Key, view: _View, now_s: float) -> bool:
         """Return whether higher-ranked proxies of this graph had time to show themselves and to begin."""
@@ -521,30 +549,33 @@ class Bridge:
             flow.follow(view.ends(Role.SUBSCRIBES, flow_spec))
         elif isinstance(flow, ExposedService):
             flow.follow(view.ends(Role.SERVES, flow_spec), now_s)
-        elif isinstance(flow, ExposedNode):
-            flow.follow(view.of_node(flow_spec))
+        elif isinstance(flow, ExposedNodes):
+            flow.follow(view.nodes_of(flow_spec.rule))
+        elif isinstance(flow, ImportedNodes):
+            flow.follow(self.rules.imports)
 
     def _flow_specs(self, at: int, graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
-        config = self.rules
-        expose = [rule for rule in config.expose if config.endpoint_of(rule) == at]
-        imports = [rule for rule in config.imports if config.endpoint_of(rule) == at]
+        expose = self._exposed_at(at)
+        imports = [rule for rule in self.rules.imports if self.rules.endpoint_of(rule) == at]
         nodes = self._brought(at, expose, graph)
         yield from exposed(expose, graph, complaints, nodes.expose)
         held = [*self.held.described(Right.READ), *self.held.described(Right.CALL)]
         yield from imported(imports, graph, held, complaints, nodes.imports)
 
-    def _brought(self, at: int, expose: Sequence[Rule], graph: Graph) -> Brought:
-        far = [(flow_spec.rule, flow.ends) for flow_spec, flow in self._imported_nodes(at)]
-        return brought(expose, graph, far)
+    def _exposed_at(self, at: int) -> list[Rule]:
+        return [rule for rule in self.rules.expose if self.rules.endpoint_of(rule) == at]
 
-    def _imported_nodes(self, at: int) -> Iterator[tuple[FlowSpec, ImportedNode]]:
+    def _brought(self, at: int, expose: Sequence[Rule], graph: Graph) -> Brought:
+        return brought(expose, graph, [each for _, flow in self._imported_nodes(at) for each in flow.nodes.values()])
+
+    def _imported_nodes(self, at: int) -> Iterator[tuple[FlowSpec, ImportedNodes]]:
         for key, (flow_spec, flow) in self._flows.items():
-            if key.dispatcher == at and isinstance(flow, ImportedNode):
+            if key.dispatcher == at and isinstance(flow, ImportedNodes):
                 yield flow_spec, flow
 
     def _far(self, at: int) -> FarNodes:
         """Return the far nodes that are described now."""
-        return {flow_spec.local: flow.ends for flow_spec, flow in self._imported_nodes(at) if flow.ends}
+        return {node: ends for _, flow in self._imported_nodes(at) for node, (_, ends) in flow.nodes.items()}
 
     def _show(self, at: int, far_nodes: FarNodes) -> None:
         """Have far nodes appear in a graph."""
@@ -561,12 +592,9 @@ class Bridge:
 
     def _begin(self, key: _Key, flow_spec: FlowSpec, view: _View) -> None:
         """Begin a flow, or record why this graph does not allow it."""
-        topic = self.held.find(flow_spec.name, _right(flow_spec))
+        topic = self._may_use(key, flow_spec)
         if topic is None:
-            self._undelegated[key] = flow_spec
-            self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
             return
-        self._undelegated.pop(key, None)
         if self._bypasses_control(key, flow_spec):
             detail = "a rule has this topic under exclusive control, and another name brings it, too: use one name"
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.REFUSED, detail)
@@ -582,12 +610,22 @@ class Bridge:
         self._flow_begun_s[key] = self._now_s
         if not isinstance(flow, ExposedTopic):
             self._inbound[flow_spec.name] = flow
-        if isinstance(flow, ExposedService | ImportedService | ImportedNode):
+        if isinstance(flow, _Timed):
             self._timed[flow] = flow_spec.local
         if isinstance(flow, ImportedTopic) and flow.control is not None:
             self._timed_topics[flow] = flow_spec.local
         self._changes.append(FlowChange(flow_spec, is_begun=True))
         log.debug("flow begun name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
+
+    def _may_use(self, key: _Key, flow_spec: FlowSpec) -> Topic | None:
+        """Return the delegation of a flow; a missing one is recorded."""
+        topic = self.held.find(flow_spec.name, _right(flow_spec))
+        if topic is None:
+            self._undelegated[key] = flow_spec
+            self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
+        else:
+            self._undelegated.pop(key, None)
+        return topic
 
     def _bypasses_control(self, key: _Key, flow_spec: FlowSpec) -> bool:
         """Return whether two names would bring one local topic, of which one is under exclusive control."""
@@ -600,8 +638,8 @@ class Bridge:
         context = self._context
         if flow_spec.rule.kind == "node":
             if flow_spec.is_exposed:
-                return ExposedNode(context, dispatcher, flow_spec, topic, view.of_node(flow_spec))
-            return ImportedNode(context, dispatcher, flow_spec, topic)
+                return ExposedNodes(context, dispatcher, flow_spec, topic, view.nodes_of(flow_spec.rule))
+            return ImportedNodes(context, dispatcher, flow_spec, topic)
         if flow_spec.rule.kind != "topic":
             kind = ExposedService if flow_spec.is_exposed else ImportedService
             return kind(context, dispatcher, flow_spec, topic, secrets.randbits(63))
@@ -641,13 +679,13 @@ class Bridge:
     def _remove(self, key: _Key) -> tuple[FlowSpec, Flow]:
         flow_spec, flow = self._flows.pop(key)
         del self._flow_begun_s[key]
-        if isinstance(flow, ExposedService | ImportedService | ImportedNode):
+        if isinstance(flow, _Timed):
             del self._timed[flow]
         if isinstance(flow, ExposedTopic | ImportedTopic):
             self._timed_topics.pop(flow, None)
         if isinstance(flow, ImportedTopic):
             self._ended.append(flow.stats)
-        if isinstance(flow, ImportedNode):
+        if isinstance(flow, ImportedNodes):
             self._is_stale = True  # what it brought ends
         self._changes.append(FlowChange(flow_spec, is_begun=False))
         return flow_spec, flow
@@ -692,8 +730,8 @@ class Bridge:
 
 def _shown_as(flow_spec: FlowSpec) -> str:
     """Return the local name at which other proxies see that this proxy carries the flow."""
-    if flow_spec.rule.kind == "node" and not flow_spec.is_exposed:
-        return presence_of_node(flow_spec.local)
+    if flow_spec.rule.kind == "node":
+        return presence_of_nodes(flow_spec.name)
     return presence_of(flow_spec.local) if flow_spec.is_exposed and flow_spec.rule.kind != "topic" else flow_spec.local
 
 

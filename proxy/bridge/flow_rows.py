@@ -21,7 +21,7 @@ from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
-from proxy.bridge.node_flow import ExposedNode, ImportedNode
+from proxy.bridge.node_flow import ExposedNodes, ImportedNodes
 
 _HIDDEN: Final = "/_gdp_proxy"  # presence topics of proxies
 _SERVERS_MAX: Final = 64
@@ -103,7 +103,7 @@ def _row(spec: FlowSpec, flow: Flow, member: Participant) -> TopicRow:
             publishers=len(member.subscriptions.writer_proxies_of(spec.name)),
             readers=flow.local_readers,
         )
-    if isinstance(flow, ExposedService | ExposedNode):
+    if isinstance(flow, ExposedService | ExposedNodes):
         return row(
             direction=Direction.OUT,
             messages=flow.requests,
@@ -111,7 +111,7 @@ def _row(spec: FlowSpec, flow: Flow, member: Participant) -> TopicRow:
             publishers=1,
             readers=len(member.services.connected_peers(spec.name)),
         )
-    if isinstance(flow, ImportedNode):
+    if isinstance(flow, ImportedNodes):
         return row(direction=Direction.IN, publishers=len(member.services.peers(spec.name)))
     return row(
         direction=Direction.IN,

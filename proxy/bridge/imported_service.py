@@ -1,9 +1,10 @@
 """Virtual server on this machine for the remote servers of one service or action.
 
 I/O: endpoint and participant; ``gdp/service/dispatch.py`` or ``gdp/service/sequencer.py`` decide. The virtual server
-exists while a remote one is reachable, so that local clients see whether there is one. A call ends with the first
-response, with a reason, or when its time is up. A later response is counted, and servers that still work on the call
-get a cancellation.
+exists while a remote one is reachable, so that local clients see whether there is one. That of a far node of a pattern
+exists while the node does: it joins the service when it has a request, which then waits for a server. A call ends with
+the first response, with a reason, or when its time is up. A later response is counted, and servers that still work on
+the call get a cancellation.
 
 It combines ``server_discovery.py`` (the servers), ``request_sender.py`` (the requests to each of them) and
 ``virtual_server.py`` (what local clients see).
@@ -20,6 +21,7 @@ from typing import Final
 from gdp.client.participant import Message, Topic
 from gdp.due_queue import earliest
 from gdp.errors import LocalError, RemoteError
+from gdp.intervals import FORGET_S, NEVER_S
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch, Failure
 from gdp.service.frames import PATIENCE_MAX_MS, Answer, Outcome, Request
@@ -37,12 +39,15 @@ from proxy.bridge.request_sender import RequestSender
 from proxy.bridge.server_discovery import SERVER_GONE, Response, ServerCalls, ServerDiscovery
 from proxy.bridge.service_flow import ServiceFlow
 from proxy.bridge.virtual_server import VirtualServer
+from proxy.config.brought_rule import BroughtRule
+from proxy.config.rule import CALL_S
 from proxy.endpoints.core.endpoint import EndpointError, Event, RequestReceived
 from proxy.serial.empty import NoAnswer
 from proxy.serial.serializer import Serializer
 from proxy.wire.replication import follower_message, is_word
 from proxy.wire.service import Exchange, News, too_large
 
+_HELD_MAX: Final = 64  # requests that wait for a server
 _FAULTS: Final = {
     Failure.TIMED_OUT: Fault.TIMED_OUT,
     Failure.NO_SERVER: Fault.NO_SERVER,
@@ -69,6 +74,7 @@ class ImportedService(ServiceFlow):
         requests: how many local clients made.
         request_bytes: their bytes in ROS's wire form.
         failed: requests that ended without a response.
+        is_joined: whether it is called on the overlay.
         answered_by: the server whose response ended the latest call; None: none did yet.
     """
 
@@ -88,7 +94,6 @@ class ImportedService(ServiceFlow):
         self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, with the reported reason
         if flow_spec.rule.is_ordered:
             self._sequencer = Sequencer(incarnation_id=lambda: secrets.randbits(INCARNATION_BITS))
-        self._publisher = context.member.call(topic, self._description(), **self.options())
         spreads = [
             ALL if self._goals is not None and part == CANCEL else flow_spec.rule.spread
             for part in range(len(self.parts.services))
@@ -113,8 +118,18 @@ class ImportedService(ServiceFlow):
         self._requests: tuple[Serializer, ...] = ()
         self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
         self._virtual_server = VirtualServer(self)
-        self._sender = RequestSender(self, self._calls, self._goals, self._publisher)
+        self._sender = RequestSender(self, self._calls, self._goals)
         self._discovery = ServerDiscovery(self, self._calls, self._goals, opened=self._open, closed=self._shut)
+        self.is_joined = False
+        self._held: list[RequestReceived] = []  # until there is a server
+        self._held_until_s = self._used_s = NEVER_S
+        self._offered: Exchange | None = None
+        rule, known = flow_spec.rule, self._known()
+        self._is_lazy = isinstance(rule, BroughtRule) and rule.is_lazy and rule.kind == "service" and known is not None
+        if self._is_lazy and known is not None:
+            self._open(known)
+        else:
+            self._join()
 
     @property
     def servers(self) -> list[Name]:
@@ -141,6 +156,10 @@ class ImportedService(ServiceFlow):
     def handle_event(self, event: Event, now_s: float) -> None:
         """Process a local client's request."""
         if isinstance(event, RequestReceived):
+            self._used_s = now_s
+            if self._is_lazy and not self.servers and len(self._held) < _HELD_MAX:
+                self._hold(event, now_s)
+                return
             self._ask(event, now_s)
             self._flush(now_s)
         elif isinstance(event, EndpointError):
@@ -148,7 +167,13 @@ class ImportedService(ServiceFlow):
 
     def tick(self, now_s: float) -> None:
         """Open or close the virtual server as remote servers join and leave."""
+        if not self.is_joined:
+            return
         self._discovery.update(now_s)
+        if self._held and (self.servers or now_s >= self._held_until_s):
+            held, self._held = self._held, []
+            for event in held:
+                self._ask(event, now_s)
         self.handle_timer(now_s)
         self._count()
         if self._sequencer is not None:
@@ -156,6 +181,8 @@ class ImportedService(ServiceFlow):
             for name in [name for name, reason in outside.items() if self._outside.get(name) != reason]:
                 self.report(Fault.REFUSED, f"server {name.short}: {outside[name]}")
             self._outside = outside
+        if self._is_lazy and now_s - self._used_s > FORGET_S and not (self._held or any(map(len, self._calls))):
+            self._leave(now_s)
 
     def handle_timer(self, now_s: float) -> None:
         """Run due timers between checks of the servers."""
@@ -165,6 +192,8 @@ class ImportedService(ServiceFlow):
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
+        if not self.is_joined:
+            return None
         if self._sender.is_ready:
             return 0.0
         of_calls = (dispatch.get_timer() for dispatch in self._calls)
@@ -173,6 +202,9 @@ class ImportedService(ServiceFlow):
     def close(self, now_s: float) -> None:
         """Close the virtual server; calls under way fail."""
         del now_s
+        for event in self._held:
+            self.report(Fault.NO_SERVER, SERVER_GONE)
+            self._virtual_server.refuse(event.handle, event.ticket, SERVER_GONE)
         self._shut("the proxy no longer carries this service")
         self._virtual_server.close_now()
         self.context.member.withdraw(self.name)
@@ -204,16 +236,42 @@ class ImportedService(ServiceFlow):
         traffic.hedged += now[2] - self._counted[2]
         self._counted = now
 
-    def _description(self) -> bytes:
-        """Return this machine's description of the service; empty where only the remote side has one."""
+    def _known(self) -> Exchange | None:
+        """Return this machine's description of the service; None where only the remote side has one."""
         try:
-            exchange = self.parts.known(self.dispatcher.endpoint, self.flow_spec.rule.encoding)
+            return self.parts.known(self.dispatcher.endpoint, self.flow_spec.rule.encoding)
         except LocalError:
-            return b""
-        return exchange.to_cbor()
+            return None
+
+    def _hold(self, event: RequestReceived, now_s: float) -> None:
+        """Keep a request until there is a server, for as long as it may wait for a response."""
+        if not self._held:
+            self._held_until_s = now_s + (self.flow_spec.rule.timeout_s or CALL_S)
+        self._held.append(event)
+        if not self.is_joined:
+            self._join()
+
+    def _join(self) -> None:
+        known, services = self._known(), self.context.member.services
+        description = b"" if known is None else known.to_cbor()
+        self._sender.publisher = self.context.member.call(self.topic, description, **self.options())
+        services.paths_for(self.name, self.flow_spec.rule.spread)  # the switch states costs from now on
+        self.is_joined = self.has_changed = True
+
+    def _leave(self, now_s: float) -> None:
+        """Leave a service that no local node has used for a while."""
+        self.context.member.withdraw(self.name)
+        self._sender.publisher, self.is_joined, self.has_changed = None, False, True
+        self._discovery.update(now_s)
 
     def _open(self, ours: Exchange) -> None:
-        self._publisher.describe(ours.to_cbor())
+        if self._sender.publisher is not None:
+            self._sender.publisher.describe(ours.to_cbor())
+        if self._offered == ours:
+            return
+        if self._offered is not None:
+            self._virtual_server.close_now()
+        self._offered = ours
         self._requests = tuple(Serializer(each.request, ours.encoding) for each in ours.services)
         self._no_answers = tuple(NoAnswer.of(each) for each in ours.services)
         self._virtual_server.open(ours)
@@ -224,7 +282,9 @@ class ImportedService(ServiceFlow):
         self._sender.clear()
         if self._goals is not None:
             self._goals.clear()
-        self._virtual_server.close()
+        if not self._is_lazy:
+            self._offered = None
+            self._virtual_server.close()
 
     def _ask(self, event: RequestReceived, now_s: float) -> None:
         part, rule = self._virtual_server.handle_request(event.handle, now_s), self.flow_spec.rule

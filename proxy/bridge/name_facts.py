@@ -6,6 +6,7 @@ I/O through the bridge, which it only reads.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from gdp.client.participant import Participant
@@ -140,6 +141,8 @@ def _of_rule(
 def _locals(bridge: Bridge, rule: Rule, asked: str, graph: Sequence[GraphEntity]) -> list[str]:
     """Return the local names of a rule that the asked text may mean."""
     if not _is_hex(asked):
+        if rule.kind == "node" and rule.is_pattern:  # its nodes have one name
+            return [rule.local] if rule.matches(asked) or asked == rule.name else []
         return [asked] if rule.matches(asked) else [rule.local] if asked == rule.name else []
     if not rule.is_pattern:
         return [rule.local]
@@ -166,7 +169,8 @@ def _flow_fact(
     rule, local, name = meant.rule, meant.local, meant.name
     right = _RIGHTS[rule.kind == "topic", meant.is_exposed]
     role = _ROLES[rule.kind, meant.is_exposed]
-    ends_here = {node_entity(end) for end in graph} if rule.kind == "node" else graph
+    meant_nodes = (end for end in graph if rule.kind == "node" and rule.matches(end.node))
+    ends_here = {replace(node_entity(end), name=local) for end in meant_nodes} if rule.kind == "node" else graph
     under = [end for end in ends_here if (end.name, end.role) == (local + _PART[rule.kind], role) and not end.is_proxy]
     ends = [end for end in under if rule.kind == "action" or end.type_name in ("", meant.type_name)]
     faults = context.faults.of(local)

@@ -63,24 +63,22 @@ class BroadcastQueue:
 class RequestSender:
     """Sends the effects of the calls of each part; effects for all servers wait for capacity of their common stream.
 
-    Args:
-        publisher: the stream that all servers receive.
+    Attributes:
+        publisher: the stream that all servers receive; None while the service is not joined.
     """
 
-    def __init__(
-        self, flow: ServiceFlow, calls: Sequence[ServerCalls], goals: Goals | None, publisher: Publisher
-    ) -> None:
+    def __init__(self, flow: ServiceFlow, calls: Sequence[ServerCalls], goals: Goals | None) -> None:
         self._flow = flow
         self._calls = calls
         self._goals = goals
-        self._publisher = publisher
+        self.publisher: Publisher | None = None
         self._for_all = BroadcastQueue()
         self._goal_of: dict[tuple[int, int], bytes] = {}  # part and call -> goal, while under way
 
     @property
     def is_ready(self) -> bool:
         """Return whether a waiting effect can be sent now."""
-        return bool(self._for_all) and self._publisher.has_space()
+        return bool(self._for_all) and self.publisher is not None and self.publisher.has_space()
 
     def note_goal(self, part: int, call: int, goal: bytes) -> None:
         """Record the goal of a call."""
@@ -124,10 +122,10 @@ class RequestSender:
         try:
             wire = wire_of(part, effect)
             call = self._key_of(part, effect)
-            if call is None:
-                self._publisher.publish(wire)
-            else:
+            if call is not None:
                 self._flow.context.member.services.send_requests(self._flow.name, wire, call)
+            elif self.publisher is not None:
+                self.publisher.publish(wire)
             self._flow.context.traffic.sent(len(wire))
             self._trace(part, effect, servers)
         except LocalError as error:

@@ -32,6 +32,7 @@ class ServiceFlow(ABC):
         far_role: what the far parties are.
         requests: how many came.
         request_bytes: their bytes.
+        has_changed: something has that other flows depend on.
     """
 
     far_role: ClassVar[PartyRole]
@@ -46,6 +47,7 @@ class ServiceFlow(ABC):
         self.parts = ActionInterface.of(flow_spec.rule.kind, flow_spec.local, flow_spec.type_name)
         self.requests = 0
         self.request_bytes = 0
+        self.has_changed = False
 
     @property
     def name(self) -> Name:
@@ -66,6 +68,11 @@ class ServiceFlow(ABC):
     def report(self, fault: Fault, reason: str) -> None:
         """Report a fault of the service."""
         self.context.faults.report(self.flow_spec.local, fault, reason)
+
+    def poll_changed(self) -> bool:
+        """Return ``has_changed``, once."""
+        has_changed, self.has_changed = self.has_changed, False
+        return has_changed
 
     def call_key(self, client: Name, part: int, call: int) -> CallKey:
         """Return the key of a call for traces."""

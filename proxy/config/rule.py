@@ -45,6 +45,7 @@ from gdp.ros_names import (
     is_pattern,
     leaves_out,
     matches,
+    meets,
     prefixed,
     unprefixed,
 )
@@ -488,6 +489,7 @@ class Rule(Section):
     def local_of(self, metadata: Metadata) -> str | None:
         """Return the local name that this metadata describes, None if the rule does not apply to it.
 
+        The nodes of a pattern that another machine exposes have one name, that pattern; of these a rule may take some.
         The owner is not in the metadata: compare ``overlay_name_of`` as well, or use ``matching.imported``.
         """
         name, type_name = metadata.get("name"), metadata.get("type")
@@ -500,7 +502,9 @@ class Rule(Section):
         own = unprefixed(self.prefix, name)
         if own is None:
             return None
-        if self.is_pattern:
+        if self.kind == "node" and is_pattern(own):
+            local = own if meets(own, self.name) else None
+        elif self.is_pattern:
             local = own if matches(self.name, own) else None
         else:
             local = self.local if own == self.name else None

@@ -28,7 +28,7 @@ from lab.topology import Attachment, Topology
 
 Yaml: TypeAlias = "dict[str, object]"
 Side = Literal["expose", "import"]
-Kind = Literal["topic", "service", "action"]
+Kind = Literal["topic", "service", "action", "node"]
 NameRights = Mapping[str, Collection[Right]]
 
 _DOMAIN: Final = "lab"

@@ -12,11 +12,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from gdp.names import Name
 from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.serial.channel import EMPTY_MD5, Channel, RosVersion
 
 SIGN: Final = "/_gdp_proxy"
 _FAR: Final = f"{SIGN}/_node"
+_RULE: Final = f"{SIGN}/_nodes/n"
 _STEP_S: Final = 0.4  # longer than a graph takes to show a new entity
 _EMPTY: Final = "std_msgs/msg/Empty"
 
@@ -59,9 +61,16 @@ def presence_of_node(node: str) -> str:
     return f"{_FAR}{node}"
 
 
+def presence_of_nodes(name: Name) -> str:
+    """Return the topic by which a proxy shows that it carries the nodes of a rule, which have one overlay name."""
+    return _RULE + name.to_text()
+
+
 def attributed(graph: Graph) -> Graph:
     """Return the graph with the entities of far nodes as those of the proxies by which they appear."""
-    proxies = {end.name.removeprefix(_FAR): end.node for end in graph if end.is_proxy and end.name.startswith(_FAR)}
+    proxies = {
+        end.name.removeprefix(_FAR): end.node for end in graph if end.is_proxy and end.name.startswith(f"{_FAR}/")
+    }
     return frozenset(replace(end, node=proxies.get(end.node, end.node)) for end in graph) if proxies else graph
 
 

@@ -10,8 +10,9 @@ from typing import Final, NamedTuple
 
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.ros_names import NODE_TYPE, Kind
+from gdp.ros_names import NODE_TYPE, Kind, is_pattern
 from proxy.bridge.core.action_interface import action_of
+from proxy.bridge.core.node_rules import nodes_in
 from proxy.bridge.faults import Fault
 from proxy.config import matching
 from proxy.config.matching import choose
@@ -72,16 +73,17 @@ def denied(rules: Sequence[Rule], graph: Graph, *, is_exposed: bool) -> Iterator
 def exposed(
     rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem], brought: Sequence[Rule] = ()
 ) -> Iterator[FlowSpec]:
-    """Yield a flow for each local node, publisher or server that a rule exposes.
+    """Yield a flow for each local publisher or server that a rule exposes, and for the nodes of each rule.
 
     Args:
         complaints: problems are added to them.
         brought: the rules of what nodes have; they apply where no other one does.
     """
     by_node = _by_name(brought)
-    shown = _shown(graph, _SHOWS)
-    shown |= {("node", end.node): {NODE_TYPE} for end in graph if end.node and not end.is_proxy}
-    for (kind, local), types in shown.items():
+    of_nodes = {id(each): each for each, _ in nodes_in(rules, graph).values()}
+    for each in of_nodes.values():  # one for all nodes of a pattern
+        yield FlowSpec(True, each.local, NODE_TYPE, each.overlay_name_of(each.local, NODE_TYPE), each)
+    for (kind, local), types in _shown(graph, _SHOWS).items():
         fitting = rules if choose(rules, kind, local) is not None else by_node.get((kind, local), ())
         first = choose(fitting, kind, local)
         if first is None:
@@ -130,7 +132,13 @@ def imported(
 def _imported(
     rules: Sequence[Rule], wanted: Mapping[tuple[Kind, str], set[str]], held: Iterable[tuple[Metadata, Name]]
 ) -> Iterator[FlowSpec]:
-    yield from _named(rules)
+    held = list(held)
+    names = {name for _, name in held}
+    of_patterns = [each for each, _ in held if each["kind"] == "node" and is_pattern(str(each["name"]))]
+    for flow_spec in _named(rules):
+        is_in_pattern = any(flow_spec.rule.local_of(each) is not None for each in of_patterns)
+        if flow_spec.name in names or not is_in_pattern:
+            yield flow_spec
     for metadata, name in held:
         found = matching.imported(rules, name, metadata)
         if found is not None:

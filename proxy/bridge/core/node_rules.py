@@ -19,9 +19,10 @@ from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.endpoints.core.qos import depth_of
 from proxy.serial.channel import Qos
-from proxy.wire.node import NodeEntity
+from proxy.wire.node import ENTITIES_MAX, NodeEntity
 
 FarNodes: TypeAlias = Mapping[str, Graph]  # the nodes of other machines, by their names here, each with its entities
+FarNode: TypeAlias = tuple[Rule, Graph]  # one of them: its rule and its entities
 _PLAIN: Final[dict[Role, Interface]] = {Role.PUBLISHES: "topic", Role.SUBSCRIBES: "topic", Role.SERVES: "service"}
 
 
@@ -49,7 +50,17 @@ def node_entity(end: GraphEntity) -> GraphEntity:
     return GraphEntity(Role.SERVES, end.node, NODE_TYPE, end.node, end.node)
 
 
-def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Graph]]) -> Brought:
+def local_node(rules: Sequence[Rule], shared: str) -> tuple[str, Rule] | None:
+    """Return the name here of a far node, and its rule; None: no rule is about it."""
+    for rule in sorted(rules, key=lambda rule: rule.is_pattern):
+        own = unprefixed(rule.prefix, shared)
+        local = None if own is None else own if rule.is_pattern else rule.local if own == rule.name else None
+        if local is not None and rule.matches(local):
+            return local, rule
+    return None
+
+
+def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[FarNode]) -> Brought:
     """Return the rules of what local nodes have that a rule exposes, and of what far nodes publish or serve.
 
     Args:
@@ -57,7 +68,7 @@ def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Grap
     """
     rules = Brought([], [])
     for rule, ends in nodes_in(expose, graph).values():
-        for is_other, each in rules_of_node(rule, ends):
+        for is_other, each in rules_of_node(rule, ends, is_near=True):
             (rules.imports if is_other else rules.expose).append(each)
     for rule, far_ends in far:
         profiles = {end.name: end.qos for end in sorted(far_ends, key=repr) if end.role is Role.PUBLISHES}
@@ -66,14 +77,19 @@ def brought(expose: Sequence[Rule], graph: Graph, far: Iterable[tuple[Rule, Grap
 
 
 def rules_of_node(
-    rule: Rule, ends: Iterable[GraphEntity], profiles: Mapping[str, Qos | None] = MappingProxyType({})
+    rule: Rule,
+    ends: Iterable[GraphEntity],
+    profiles: Mapping[str, Qos | None] = MappingProxyType({}),
+    *,
+    is_near: bool = False,
 ) -> Iterator[tuple[bool, Rule]]:
     """Yield the rule of each thing that a node has, and whether it goes in the other direction than the node.
 
     Args:
         profiles: what far publishers offer, by topic.
+        is_near: the node is of this machine's graph.
     """
-    by_node = BroughtRule.by(rule)
+    by_node = BroughtRule.by(rule, is_near=is_near)
     found = {(end.role is Role.SUBSCRIBES, *thing) for end in ends if (thing := _thing(end)) is not None}
     for is_other, kind, name, type_name in sorted(found):
         if by_node.denied_by(name) is None:
@@ -103,7 +119,7 @@ def _thing(end: GraphEntity) -> tuple[Interface, str, str] | None:
     return kind, end.name, end.type_name
 
 
-def described(rule: Rule, ends: Iterable[GraphEntity]) -> list[NodeEntity]:
+def described(rule: Rule, ends: Iterable[GraphEntity]) -> tuple[NodeEntity, ...]:
     """Return a node's entities for other machines, without denied ones."""
     by_node = BroughtRule.by(rule)
     found = {
@@ -111,7 +127,8 @@ def described(rule: Rule, ends: Iterable[GraphEntity]) -> list[NodeEntity]:
         for end in ends
         if end.type_name and by_node.denied_by(_whole(end.name)) is None
     }
-    return sorted(found, key=lambda each: (each.role.value, each.name, each.type_name, repr(each.qos)))
+    found_in_order = sorted(found, key=lambda each: (each.role.value, each.name, each.type_name, repr(each.qos)))
+    return tuple(found_in_order[:ENTITIES_MAX])
 
 
 def local_ends(rule: Rule, node: str, entities: Iterable[NodeEntity]) -> Iterator[GraphEntity]:

@@ -7,6 +7,7 @@ delegations, from live graphs.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -50,7 +51,9 @@ def needs(machines: Sequence[Machine], owner: PublicKey) -> list[list[RequiredDe
     """Return the needs of each machine, sorted by kind and ROS name."""
     offers = [_offered(machine, owner) for machine in machines]
     everywhere = {name: metadata for each in offers for name, metadata in each.items()}
-    brought = {name: rules for machine in machines for name, rules in _brought(machine, owner)}
+    brought = defaultdict[Name, list[tuple[bool, Rule]]](list)
+    for name, rules in (each for machine in machines for each in _brought(machine, owner)):
+        brought[name] += rules
     return [
         _of_machine(machine.config, own, {**everywhere, **_asked(machine, owner)}, brought)
         for machine, own in zip(machines, offers, strict=True)
@@ -101,11 +104,11 @@ def _offered(machine: Machine, owner: PublicKey) -> dict[Name, Metadata]:
 
 
 def _brought(machine: Machine, owner: PublicKey) -> Iterator[tuple[Name, list[tuple[bool, Rule]]]]:
-    """Yield the nodes that a machine exposes, each with the rules of what it has, and whether it hears that."""
+    """Yield the name of each node that a machine exposes, with the rules of what it has, and whether it hears that."""
     for at, graph in enumerate(machine.graphs):
         rules = _of(_rules_at(machine.config, machine.config.expose, at), owner)
-        for node, (rule, ends) in nodes_in(list(rules), graph).items():
-            yield rule.overlay_name_of(node, NODE_TYPE), list(rules_of_node(rule, ends))
+        for rule, ends in nodes_in(list(rules), graph).values():
+            yield rule.overlay_name_of(rule.local, NODE_TYPE), list(rules_of_node(rule, ends))
 
 
 def _asked(machine: Machine, owner: PublicKey) -> dict[Name, Metadata]:

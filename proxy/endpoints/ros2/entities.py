@@ -7,6 +7,7 @@ reads a bounded number, so that one busy topic does not delay the others.
 from __future__ import annotations
 
 import time
+import warnings
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -39,6 +40,7 @@ from proxy.serial.channel import Channel, Qos
 Kind: TypeAlias = Literal["subscription", "service", "client"]
 
 _AT_ONCE: Final = 64
+_WARNING: Final = Lock()  # a record of warnings is one of the process
 _TICKETS_MAX: Final = 10_000
 _WINDOW: Final = 8  # less than the ten slots of a server's queue
 _WINDOW_S: Final = 0.1
@@ -141,6 +143,7 @@ class ServiceEntity:
         self.response = service.Response
         self._tickets: OrderedDict[int, RequestId] = OrderedDict()
         self._next = 1
+        self._late: deque[tuple[object, RequestId, float]] = deque()  # not sent yet, and until when each may be
         self._lock = Lock()
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
@@ -169,7 +172,22 @@ class ServiceEntity:
         with self._lock:
             request = self._tickets.pop(ticket, None)
         if request is not None:
+            self._send(response, request, time.monotonic() + _PATIENCE_S)
+
+    def tend(self, now_s: float) -> None:
+        """Send again what clients could not get that had not discovered this server."""
+        for _ in range(len(self._late)):
+            response, request, until_s = self._late.popleft()
+            if now_s < until_s:
+                self._send(response, request, until_s)
+
+    def _send(self, response: object, request: RequestId, until_s: float) -> None:
+        """Send a response; where its client does not match this server yet, rclpy only warns and drops it."""
+        with _WARNING, warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
             self.handle.service_send_response(response, request)
+        if caught:
+            self._late.append((response, request, until_s))
 
     def forget(self, ticket: int) -> None:
         """Leave a request unanswered."""

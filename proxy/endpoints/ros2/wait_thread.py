@@ -16,7 +16,7 @@ from typing import Final
 
 from gdp.intervals import WATCH_S
 from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphChanged, MessageReceived, Role, TypeResolved
-from proxy.endpoints.ros2.entities import ClientEntity, Kind, PublisherEntity, Source, SubscriptionEntity
+from proxy.endpoints.ros2.entities import ClientEntity, Kind, PublisherEntity, ServiceEntity, Source, SubscriptionEntity
 from proxy.endpoints.ros2.graph_cache import GraphCache
 from proxy.endpoints.ros2.qos import incompatibility
 from proxy.endpoints.ros2.session import ContextNode
@@ -141,6 +141,7 @@ class WaitThread:
         joins_when_full = [source.join(wait_set) for source in sources if source.kind != "subscription"]
         used = [(kind, table) for kind, table in tables.items() if table]
         client_entity = [source for source in sources if isinstance(source, ClientEntity)]
+        servers = [source for source in sources if isinstance(source, ServiceEntity)]
         while not self._has_changed and not self._is_over:
             wait_set.clear_entities()
             wait_set.add_guard_condition(self._guard)
@@ -156,6 +157,8 @@ class WaitThread:
             if is_holding or now_s >= due_s:
                 self._post([event for source in client_entity for event in source.tend(now_s)])
             if now_s >= due_s:
+                for source in servers:
+                    source.tend(now_s)
                 self._refresh_graph()
                 due_s = time.monotonic() + WATCH_S
         wait_set.destroy_when_not_in_use()

@@ -155,7 +155,8 @@ class Machine:
         listed, qos = [], []
         for kind, local, type_name in self.graph:
             rules = self.config.expose if self.config is not None else ()
-            rule = choose(rules, kind, local, type_name)  # type: ignore[arg-type]
+            rule = next((each for each in rules if each.kind == kind == "node" and each.name == local), None)
+            rule = rule or choose(rules, kind, local, type_name)  # type: ignore[arg-type]
             name = None if rule is None else rule.overlay_name_of(local, type_name)
             if name is not None and local in self.qos:
                 qos.append({"name": name.to_text(), **self.qos[local].model_dump()})
@@ -165,7 +166,8 @@ class Machine:
                 listed.append({**fields, "name": name.to_text()})
         rules = () if self.config is None else (*self.config.expose, *self.config.imports)
         for node, side, kind, local, type_name in self.brought:
-            if (rule := choose(rules, "node", node)) is not None:
+            of_pattern = next((each for each in rules if each.kind == "node" and each.name == node), None)
+            if (rule := of_pattern or choose(rules, "node", node)) is not None:
                 name = BroughtRule.by(rule).of(kind, local, type_name).overlay_name_of(local, type_name)
                 fields = {
                     "side": side,

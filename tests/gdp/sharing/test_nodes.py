@@ -77,3 +77,15 @@ def test_what_a_node_subscribes_to_is_accepted_by_name(site: Site, robot: Machin
     server.sharing.accept(AcceptedName(side="expose", name="/cmd", source="robot"), site.now_s)
     assert server.rights()["/cmd"] == {"publish"}
     assert server.rules("expose") == [("/cmd", STRING)]
+
+
+def test_of_the_nodes_of_a_pattern_a_machine_may_take_some(site: Site, robot: Machine, server: Machine) -> None:
+    robot.graph = [("node", "/*", NODE_TYPE)]  # as the live proxy names the nodes of the rule
+    robot.brought = [("/*", side, *thing) for side, *thing in HAS]  # type: ignore[misc]
+    server.brought = [("/talker", OTHER_SIDE[side], *thing) for side, *thing in HAS]  # type: ignore[misc]
+    robot.sharing.expose(robot.exposing("/*", "server", kind="node"), site.now_s)
+    server.sharing.accept(importing("/talker", "robot"), site.now_s)
+    for _ in range(3):
+        assert site.upkeep() == []
+    assert server.rights() == {"/*": {"call"}, "/chatter": {"read"}, "/talker/plan": {"call"}}
+    assert server.rules("import") == [("/talker", NODE_TYPE)]

@@ -98,6 +98,16 @@ def test_a_damaged_or_missing_segment_is_repaired_from_another_holder(
         assert capsule.damage == ""
 
 
+def test_a_file_that_vanishes_under_a_running_holder_is_fetched_again(tmp_path: Path) -> None:
+    with mock.patch.object(capsule_store, "SEGMENT_BYTES", FILE_BYTES):
+        one, two = Site(tmp_path, "one"), Site(tmp_path, "two")
+        one.append(DATA, 0)
+        two.append(DATA, 0)
+        sorted((one.folder / ABOUT.name.to_text()).glob("*.records"))[1].unlink()
+        one.upkeep(two)
+        assert one.data == DATA
+
+
 def test_what_a_quota_refuses_is_not_read_and_hides_no_other_capsule(tmp_path: Path) -> None:
     abouts = [descriptor(f"/of-one/{number}") for number in range(5)]
     other = descriptor("/of-another", which=1)

@@ -15,6 +15,7 @@ from gdp.trust.right import Right
 from lab.process import until
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.endpoints.core.endpoint import proxy_node_name
@@ -38,19 +39,27 @@ class Machine:
         self.config = sites.config(expose, imports)
         self.given: dict[Name, tuple[Metadata, set[Right]]] = {}
         self._sites = sites
+        self.far: Machine | None = None
         self.bridge = Bridge(self.context, self.config, [self.endpoint], self._held())
 
     def work(self, now_s: float) -> None:
         """Do what the proxy's loop does, and get the delegations that are missing."""
         self.bridge.work(now_s)
-        for spec in self.bridge.undelegated:
+        if lacking := self.bridge.undelegated:
+            self.grant(lacking)
+            for spec in lacking:  # a pattern of nodes has one name, which its exposer alone knows
+                if spec.rule.kind == "node" and spec.is_exposed and self.far is not None:
+                    self.far.grant([spec._replace(is_exposed=False)])
+        self.member.flush(now_s)
+
+    def grant(self, lacking: Sequence[FlowSpec]) -> None:
+        """Delegate what flows lack."""
+        for spec in lacking:
             metadata = spec.rule.metadata_of(spec.local, spec.type_name)
             topic, serve, call = _RIGHTS
             rights = topic if spec.rule.kind == "topic" else serve if spec.is_exposed else call
             self.given.setdefault(spec.name, (metadata, set()))[1].update(rights)
-        if self.bridge.undelegated:
-            self.bridge.reload(self.config, self._held())
-        self.member.flush(now_s)
+        self.bridge.reload(self.config, self._held())
 
     def _held(self) -> Granted:
         return Granted(self._sites._folder, [self._sites._topic(self.member, *each) for each in self.given.values()])
@@ -78,6 +87,7 @@ class Ros2Sites:
         self.sites.run(0.1)
         self.robot = Machine(self.sites, "nuc1/robot", domains[0], expose, ())
         self.station = Machine(self.sites, "nuc5/server", domains[1], gives, imports)
+        self.robot.far = self.station
         self.machines = {"nuc1/robot": self.robot, "nuc5/server": self.station}
         self._last_s = time.monotonic()
 

@@ -9,6 +9,7 @@ import pytest
 
 from gdp.metadata import Metadata
 from gdp.ros_names import NODE_TYPE
+from proxy.bridge.name_facts import proxy_facts
 from proxy.endpoints.core.endpoint import Role
 from tests.proxy.bridge.clients import Client
 from tests.proxy.bridge.known import FIBONACCI, SET_BOOL, STRING, string, switch, switched
@@ -140,7 +141,7 @@ def test_what_it_gains_and_loses_follows(sites: Sites) -> None:
 
 
 def test_a_topic_of_two_nodes_stays_while_one_has_it(sites: Sites) -> None:
-    holds = [*HOLDS, named("/other", NODE_TYPE, "node")]
+    holds = [*HOLDS, named("/*", NODE_TYPE, "node")]
     robot = sites.add(ROBOT, expose=["kind: node, name: /*"], holds=holds)
     station = sites.add(SERVER, imports=["kind: node, name: /*"], holds=holds)
     parts, second = talker(robot.graph), robot.graph.publish("/other", "/chatter", STRING)
@@ -185,3 +186,15 @@ def test_a_rule_about_a_name_itself_precedes_that_of_its_node(sites: Sites) -> N
     assert sites.run(5, lambda: ("/chatter", True) in robot.carried)
     rules = {spec.local: spec.rule for spec, _ in robot.bridge.flows}
     assert (rules["/chatter"].max_hz, rules["/rosout"].max_hz) == (1, None)
+
+
+def test_what_is_known_of_a_node_of_a_pattern_is_that_of_its_rule(sites: Sites) -> None:
+    holds = [*HOLDS, named("/*", NODE_TYPE, "node")]
+    robot = sites.add(ROBOT, expose=["kind: node, name: /*"], holds=holds)
+    station = sites.add(SERVER, imports=["kind: node, name: /*"], holds=holds)
+    talker(robot.graph)
+    assert sites.run(5, lambda: bool(shown(station)))
+    identity = next(each for each in sites.world.identities.values() if each.name == robot.member.name)
+    facts = proxy_facts(robot.bridge, robot.context, identity, "/talker", sites.world.network.now)
+    (flow,) = [each for each in facts.flows if each.kind == "node"]
+    assert (flow.is_carried, flow.nodes, flow.delegated) == (True, 1, "yes")

@@ -27,8 +27,8 @@ GRAPH = {  # what a verb prints, by call
 }
 PAGE = Path(__file__).parents[3] / "docs/reference/ros2cli.md"
 NOT = """
-Not the same: GIDs are those of the other graph. Events of deadline, liveliness and lifespan do not cross. `component`,
-`bag` and tf2 use services and topics as above; the test does not run them.
+Not the same: GIDs are those of the other graph. Events of deadline, liveliness and lifespan do not cross. `component`
+and tf2 use services and topics as above; the test does not run them, for their types have no wheels.
 """
 VERBS = {
     **GRAPH,
@@ -46,6 +46,7 @@ VERBS = {
     "param load": "param_load(node)",
     "service get_type_description": "type_description(node)",
     "action send_goal": "action_send_goal(node)",
+    "bag record": "bag_record(node)",
     "lifecycle list": "lifecycle_list(node)",
     "lifecycle get": "lifecycle_get(node)",
     "lifecycle set": "lifecycle_set(node)",

@@ -208,7 +208,7 @@ class FakeEndpoint:
         self._graph = graph
         self._node = node
         self._nodes: Mapping[str, Graph] = {}  # far ones
-        self._shown: list[Publication | Subscription] = []
+        self._shown: dict[str, tuple[Graph, list[Publication | Subscription]]] = {}
         self._events = deque[Event]()
         self._open: dict[int, _Open] = {}
         self._numbers = count(1)
@@ -266,17 +266,24 @@ class FakeEndpoint:
 
     def set_nodes(self, nodes: Mapping[str, Graph]) -> None:
         """Replace the far nodes; what they own is not moved."""
+        for node, (ends, shown) in list(self._shown.items()):
+            if nodes.get(node) != ends:
+                for each in shown:
+                    each.close()
+                del self._shown[node]
         self._nodes = nodes
-        for each in self._shown:
-            each.close()
-        self._shown = [
-            self._graph.publish(node, end.name, end.type_name, end.qos)
-            if end.role is Role.PUBLISHES
-            else self._graph.subscribe(node, end.name, end.type_name, lambda _: None, end.qos)
-            for node, ends in sorted(nodes.items())
-            for end in ends
-            if end.role in (Role.PUBLISHES, Role.SUBSCRIBES)
-        ]
+        for node, ends in sorted(nodes.items()):
+            if node not in self._shown:
+                self._shown[node] = (
+                    ends,
+                    [
+                        self._graph.publish(node, end.name, end.type_name, end.qos)
+                        if end.role is Role.PUBLISHES
+                        else self._graph.subscribe(node, end.name, end.type_name, lambda _: None, end.qos)
+                        for end in ends
+                        if end.role in (Role.PUBLISHES, Role.SUBSCRIBES)
+                    ],
+                )
 
     def _owner(self, role: Role, name: str) -> str:
         has = (node for node, ends in self._nodes.items() if any((end.role, end.name) == (role, name) for end in ends))

@@ -80,6 +80,24 @@ def topic_hz(node: Node) -> object:
     return [_first(node, String, "/chatter", 10, count=5).data, _first(node, PointStamped, "/point", _sensor()).point.x]
 
 
+def bag_record(node: Node) -> object:
+    """Return which topics bring messages as bytes, by which a recorder takes every type."""
+    types = dict(node.get_topic_names_and_types())
+    raws: dict[str, bytes] = {}
+    kinds = {"std_msgs/msg/String": String, "geometry_msgs/msg/PointStamped": PointStamped}
+    taken = [
+        node.create_subscription(
+            kinds[types[topic][0]], topic, lambda raw, topic=topic: raws.setdefault(topic, raw), _sensor(), raw=True
+        )
+        for topic in ("/chatter", "/point")
+    ]
+    try:
+        return _until(lambda: len(raws) == len(taken)), {topic: len(raw) for topic, raw in sorted(raws.items())}
+    finally:
+        for each in taken:
+            node.destroy_subscription(each)
+
+
 def topic_delay(node: Node) -> object:
     stamp = _first(node, PointStamped, "/point", _sensor()).header.stamp
     return abs(node.get_clock().now().nanoseconds / 1e9 - stamp.sec - stamp.nanosec / 1e9) < _PATIENCE_S

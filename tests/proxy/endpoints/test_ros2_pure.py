@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import time
+import warnings
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
 from proxy.endpoints.core.endpoint import GraphEntity, Role
+from proxy.endpoints.ros2.entities import ServiceEntity
 from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
 from proxy.endpoints.ros2.qos import conflict, filled, incompatibility
+from proxy.endpoints.ros2.session import ServiceType
 from proxy.serial.channel import Channel, Qos
 
 RELIABLE = filled(None)
@@ -99,3 +105,31 @@ def test_memory_is_bounded() -> None:
         own.add(b"\0\1\0\0%d" % number, 0.0)
     assert not own.is_loopback(b"\0\1\0\0" + b"1", 0.1)
     assert own.is_loopback(b"\0\1\0\0" + b"9999", 0.1)
+
+
+class UnmatchedService:
+    """Server's handle of rcl whose client does not match yet for some sends."""
+
+    def __init__(self, unmatched: int) -> None:
+        self.unmatched = unmatched
+        self.sent = list[object]()
+
+    def service_send_response(self, response: object, request: object) -> None:
+        """Send a response, or warn as rclpy does when rmw gives up."""
+        del request
+        self.unmatched -= 1
+        if self.unmatched >= 0:
+            warnings.warn("failed to send response (timeout)", RuntimeWarning, stacklevel=2)
+        else:
+            self.sent.append(response)
+
+
+@pytest.mark.parametrize(("unmatched", "later_s", "sent"), [(1, 0.5, ["yes"]), (2, 0.5, []), (1, 2.0, [])])
+def test_a_response_is_sent_again_until_its_client_matches(unmatched: int, later_s: float, sent: list[str]) -> None:
+    handle = UnmatchedService(unmatched)
+    entity = ServiceEntity(1, cast("ServiceType", SimpleNamespace(Request=str, Response=str)), handle)  # type: ignore[arg-type]
+    entity._tickets[7] = SimpleNamespace(sequence_number=1)
+    entity.send(7, "yes")
+    assert handle.sent == []
+    entity.tend(time.monotonic() + later_s)
+    assert handle.sent == sent
