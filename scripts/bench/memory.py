@@ -58,7 +58,7 @@ def site(folder: Path, *, keeps: bool = True, is_reliable: bool = True) -> tuple
 
 
 def image(rng: random.Random, number: int) -> bytes:
-    """Return a numbered picture with a text that nobody but a reader may find."""
+    """Return a numbered picture with a text that only a reader may find."""
     return b"%d " % number + MARKER + rng.randbytes(IMAGE_BYTES)
 
 
@@ -71,10 +71,10 @@ def ideal_s(pieces: list[tuple[float, float]], cumulated: list[tuple[float, int]
     for begin, end in pairwise(edges):
         there = known.get(begin, there)
         if any(up <= begin < down for up, down in pieces):
-            room = (end - begin) * UPLINK_BYTES_S
-            if carried + min(room, there - carried) >= total:
+            possible = (end - begin) * UPLINK_BYTES_S
+            if carried + min(possible, there - carried) >= total:
                 return begin + (total - carried) / UPLINK_BYTES_S
-            carried += min(room, there - carried)
+            carried += min(possible, there - carried)
     return edges[-1]
 
 
