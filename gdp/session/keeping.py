@@ -360,6 +360,8 @@ class CapsuleKeeper:
 
     def handle(self, now: Timestamps) -> None:
         """Write and upload what is there, and handle the timers that are due."""
+        if not self._clients:
+            return  # nothing is kept yet, and no holder asked
         if now.mono_s >= self._due_s:
             self.flush(now.unix_s)
             is_busy = bool(self.ended) or any(each.is_busy for each in self.topics.values())
