@@ -71,7 +71,11 @@ def test_a_replayed_drive_is_exported_as_it_was_recorded(tmp_path: Path) -> None
         done = lab.run(
             "gdp-replay", str(drive), "--config", str(config), "--rate", "0", "--wait-readers", "0", "--json"
         )
-        assert '"done"' in done.stdout, done.stderr
+        assert done.returncode == 0, done.stdout + done.stderr
+        said = json.loads(done.stdout.splitlines()[-1])
+        assert (said["event"], said["unconfirmed"]) == ("done", [])
+        assert {each["topic"] for each in said["held"]} == set(TOPICS)
+        assert all(each["messages"] and each["bytes"] and each["holders"] == 1 for each in said["held"])
         exported = lab.run("gdp", "store", "export", *TOPICS, "--node", "investigator", "-o", str(incident), "--json")
         assert exported.returncode == 0, exported.stdout + exported.stderr
         assert content(incident) == content(drive)
@@ -106,7 +110,7 @@ def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path
         done = lab.run(
             "gdp-replay", str(drive), "--config", str(config), "--rate", "0", "--wait-readers", "0", "--json"
         )
-        assert '"done"' in done.stdout, done.stderr
+        assert done.returncode == 0, done.stdout + done.stderr
 
         def are_equal() -> bool:
             held = [[each.read_bytes() for each in store.rglob("*.records")] for store in (first, second)]
