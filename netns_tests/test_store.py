@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from gdp.crypto.certificates import Role
 from gdp.stores.keyring import OWNER_PUBLIC
 from gdp.trust.right import Right
+from lab.credentials import make_nodes
+from lab.machine import GDP
 from lab.process import LabProcess, until
 from netns_tests.session_lab import PATIENCE_S, SessionLab, lines_of, session_lab
 from proxy.recordings.reader import BagReader
@@ -71,7 +74,11 @@ def test_a_replayed_drive_is_exported_as_it_was_recorded(tmp_path: Path) -> None
         done = lab.run(
             "gdp-replay", str(drive), "--config", str(config), "--rate", "0", "--wait-readers", "0", "--json"
         )
-        assert '"done"' in done.stdout, done.stderr
+        assert done.returncode == 0, done.stdout + done.stderr
+        said = json.loads(done.stdout.splitlines()[-1])
+        assert (said["event"], said["unconfirmed"]) == ("done", [])
+        assert {each["topic"] for each in said["held"]} == set(TOPICS)
+        assert all(each["messages"] and each["bytes"] and each["holders"] == 1 for each in said["held"])
         exported = lab.run("gdp", "store", "export", *TOPICS, "--node", "investigator", "-o", str(incident), "--json")
         assert exported.returncode == 0, exported.stdout + exported.stderr
         assert content(incident) == content(drive)
@@ -106,7 +113,7 @@ def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path
         done = lab.run(
             "gdp-replay", str(drive), "--config", str(config), "--rate", "0", "--wait-readers", "0", "--json"
         )
-        assert '"done"' in done.stdout, done.stderr
+        assert done.returncode == 0, done.stdout + done.stderr
 
         def are_equal() -> bool:
             held = [[each.read_bytes() for each in store.rglob("*.records")] for store in (first, second)]
@@ -122,3 +129,36 @@ def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path
         assert "repaired from store-b" in words[-1]
         assert segment.read_bytes() == data
         two.finish(signal.SIGTERM)
+
+
+def test_gdp_up_runs_the_holder_of_a_machine(tmp_path: Path) -> None:
+    with session_lab({}) as lab:
+        nodes = {"switch": Role.SWITCH, "rib": Role.RIB, "store": Role.PROXY, "robot": Role.PROXY}
+        rights: dict[str, dict[str, Collection[Right]]] = {
+            "robot": {"/scan": [Right.PUBLISH], "store": [Right.CALL]},
+            "store": {"store": [Right.SERVE]},
+        }
+        make_nodes(lab.folder, nodes, rights, TOPICS)
+        drive, store = lab.folder / "drive.mcap", lab.folder / "capsules"
+        machine = lab.folder / "machine.yaml"
+        switch = "switch: {data_plane: raw, attach: [rib0, store0, robot0]}\nrib:\n"
+        machine.write_text(f"{switch}store: {{holds: {{folder: capsules}}}}\n")
+        refused = lab.run(*GDP, "up", str(lab.folder), "--no-systemd")
+        assert refused.returncode == 2
+        assert "machine.yaml:3:25: holds.folder: no such directory" in refused.stderr
+        store.mkdir()
+        both = lab.run(*GDP, "store", "serve", "--config", str(machine), "--store", str(store))
+        assert (both.returncode, "leave out NODE and the options" in both.stderr) == (2, True)
+        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
+        up = lab.launch([*GDP, "up", str(lab.folder), "--no-systemd"], "up")
+        up.until_logged(r"^store  \| holder .* serves store")
+        done = lab.run(
+            "gdp-replay", str(drive), "--config", str(robot(lab, ["/scan"])), "--rate", "0", "--wait-readers", "0"
+        )
+        assert (done.returncode, "/scan" in done.stdout) == (0, True), done.stdout + done.stderr
+        assert "messages without a reader; its holder has its capsule" in done.stdout
+        (listed,) = lab.output("gdp", "store", "ls", "--store", str(store), "--json").splitlines()
+        assert json.loads(listed)["head"] > 0
+        up.finish()
+        assert up.code == 0, up.logged
+        assert [line.split()[0] for line in up.logged.splitlines() if "stopping signal=2" in line] == ["rib", "switch"]

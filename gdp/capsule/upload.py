@@ -35,6 +35,7 @@ class Uploader:
     Attributes:
         confirmed: behind the last byte that the holder has confirmed.
         is_refused: the latest request failed.
+        missing_bytes: that were dropped here before the holder had them.
     """
 
     def __init__(self, name: Name, descriptor: Descriptor) -> None:
@@ -47,6 +48,7 @@ class Uploader:
         self._is_chosen = True
         self.confirmed = 0
         self.is_refused = False
+        self.missing_bytes = 0
         self._faults: list[str] = []
 
     def next_step(
@@ -85,6 +87,7 @@ class Uploader:
             self._head, end = span
         if self._head < begin:
             self._note(f"the holder never had bytes {self._head} to {begin}: the ring here was full")
+            self.missing_bytes += begin - self._head
             self._head = begin
         if self._head >= end:
             return None

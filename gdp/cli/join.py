@@ -118,7 +118,7 @@ def up(
     no_systemd: NoSystemd = False,
     as_json: options.Json = False,
 ) -> None:
-    """Start the programs of a machine: switch, RIB where it has one, and proxy.
+    """Start the programs of a machine: switch, proxy, and RIB and store where it has them.
 
     A machine that joined or created a domain starts as systemd units, or in the foreground. Nodes that were configured
     by hand, in machine.yaml or in files of their own, run in the foreground until Ctrl-C; gdp unit install makes

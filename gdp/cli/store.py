@@ -21,13 +21,18 @@ from gdp.capsule.windows import Mark
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
 from gdp.cli.local_nodes import Node as LocalNode
 from gdp.cli.local_nodes import connect
-from gdp.cli.node import Json, Logs, failing_clearly, report, running
+from gdp.cli.node import AwaitIface, Check, Json, Logs, failing_clearly, report, running
 from gdp.cli.program import ungrouped
+from gdp.config.store_config import MIN, HolderConfig, StoreConfig
+from gdp.crypto.certificates import Role
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import ANSWER_S, DAY_S, UPKEEP_S
+from gdp.links.uplink import wait_for_device
 from gdp.names import Name
+from gdp.nodes.membership import load_member
 from gdp.session.protocol.messages import Request
-from gdp.session.session import Session, open_session
+from gdp.session.session import Session, open_node
+from gdp.session.settings import SessionConfig, settings_of
 from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, StoreLimits, marks_of, remove, stored
 from gdp.stores.holder_exchange import run
 from gdp.stores.holder_upkeep import HolderUpkeep
@@ -48,20 +53,35 @@ _DAMAGED = 1
 _REPLY_BYTES = 1_024
 
 
-@app.command(epilog="Example: gdp store serve holder --service store --store /var/lib/gdp/capsules --quota 100")
+@app.command(
+    epilog="Examples: gdp store serve holder --store /var/lib/gdp/capsules; gdp store serve --config store.yaml"
+)
 @ungrouped
 def serve(
-    node: Annotated[Path, typer.Argument(help="The holder's node: its directory, or its configuration file.")],
-    store: Folder,
-    service: Annotated[str, typer.Option(help="Name of the service, as the owner delegated it.")] = "store",
-    quota: Annotated[float, typer.Option(min=0.001, metavar="GB", help="Of all topics of one owner.")] = 100.0,
-    days: Annotated[float | None, typer.Option(min=0.001, help="Older segments go. Default: none.")] = None,
+    node: Annotated[
+        Path | None, typer.Argument(help="The holder's node: its directory, or its configuration file.")
+    ] = None,
+    store: Annotated[
+        Path | None, typer.Option("--store", metavar="FOLDER", help="Where the holder has its capsules.")
+    ] = None,
+    service: Annotated[
+        str | None, typer.Option(help="Name of the service, as the owner delegated it. Default: store.")
+    ] = None,
+    quota: Annotated[
+        float | None, typer.Option(min=MIN, metavar="GB", help="Of all topics of one owner. Default: 100.")
+    ] = None,
+    days: Annotated[float | None, typer.Option(min=MIN, help="Older segments go. Default: none.")] = None,
     most: Annotated[
-        float | None, typer.Option(min=0.001, metavar="GB", help="Of one capsule, whose oldest segments go.")
+        float | None, typer.Option(min=MIN, metavar="GB", help="Of one capsule, whose oldest segments go.")
     ] = None,
     peer: Annotated[
         list[str] | None, typer.Option(metavar="SERVICE", help="Another holder, to become equal with. Repeatable.")
     ] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="A store.yaml, in place of NODE and these options.")
+    ] = None,
+    await_iface: AwaitIface = 0.0,
+    check: Check = False,
     json: Json = False,
     *,
     logs: Logs,
@@ -70,12 +90,40 @@ def serve(
 
     All is read again slowly; what is damaged is repaired from another holder, and printed.
     """
+    stated = {"folder": store, "service": service, "quota_gb": quota, "days": days, "most_gb": most, "peers": peer}
+    given = {key: value for key, value in stated.items() if value}
+    with running(logs):
+        member, holds = _settings(node, given, config)
+        if check:
+            name = load_member(member.identity, member.domain, Role.PROXY)[0].name
+            report("checked", f"configuration good: holder {name.short}", json=json, name=name.to_text())
+            return
+        wait_for_device(member.iface, await_iface)
+        _hold(member, holds, json=json)
+
+
+def _settings(
+    node: Path | None, given: Mapping[str, object], config: Path | None
+) -> tuple[SessionConfig, HolderConfig]:
+    """Return what a file states, or the command line. Raises ``LocalError``: neither or both do."""
+    if config is not None:
+        if node is not None or given:
+            raise LocalError(f"{config} states all of the holder; leave out NODE and the options next to --config")
+        settings = StoreConfig.load(config)
+        return SessionConfig.model_construct(**dict(settings)), settings.holds
+    if node is None or "folder" not in given:
+        raise LocalError("a holder needs NODE and --store FOLDER, or --config FILE")
+    return settings_of(node), HolderConfig.model_construct(None, **given)
+
+
+def _hold(member: SessionConfig, holds: HolderConfig, *, json: bool) -> None:
+    service = holds.service
     limits = StoreLimits(
-        owner_bytes=int(quota * 1e9),
-        capsule_bytes=None if most is None else int(most * 1e9),
-        age_s=None if days is None else days * DAY_S,
+        owner_bytes=int(holds.quota_gb * 1e9),
+        capsule_bytes=None if holds.most_gb is None else int(holds.most_gb * 1e9),
+        age_s=None if holds.days is None else holds.days * DAY_S,
     )
-    with running(logs), CapsuleStore(store, limits) as capsules, open_session(node) as session:
+    with CapsuleStore(holds.folder, limits) as capsules, open_node(member) as session:
 
         def answer(request: Request) -> bytes:
             return capsules.handle(request.payload, request.client)
@@ -83,7 +131,7 @@ def serve(
         server = session.serve(service, answer, workers=2, priority="background")
         text = f"holder {session.name.short} serves {service}; Ctrl-C ends it"
         report("ready", text, json=json, name=str(server.name))
-        upkeep = HolderUpkeep(capsules, peer or (), time.monotonic())
+        upkeep = HolderUpkeep(capsules, holds.peers, time.monotonic())
         while not server.is_closed_within(UPKEEP_S):
             for holder, steps in upkeep.handle_timer(time.monotonic()):
                 try:

@@ -45,7 +45,7 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the files, and ch
 def install(path: Where = None, dry_run: DryRun = False, as_json: options.Json = False) -> None:
     """Write a unit for each node of a machine, start it now and at each boot, and wait until all are up.
 
-    The nodes are those of machine.yaml, or of switch.yaml, relay.yaml, rib.yaml, proxy.yaml and fog.yaml in the folder.
+    The nodes are those of machine.yaml, or of switch, relay, rib, proxy, store and fog.yaml in the folder.
     Each configuration is checked first. If a unit does not start, all are removed again.
 
     \b

@@ -6,9 +6,10 @@ I/O; reads the file. Each node's command reads its own section, so it accepts th
     switch: {ports: [{iface: eth0}]}    # keys of switch.yaml
     rib: {}                             # keys of rib.yaml; without the section no RIB runs here
     proxy: proxy.yaml                   # that file, or its keys
+    store: {holds: {folder: capsules}}  # keys of store.yaml
 
 A section that leaves out ``identity`` means the folder of its own name. The switch attaches the other sections, at
-``rib0`` and ``proxy0``.
+``rib0``, ``proxy0`` and ``store0``.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from typing import Final
 from gdp.config.yaml_source import KeyPath, Mark, Plain, YamlSource, read_yaml
 
 MACHINE_FILE: Final = "machine.yaml"
-NODE_SECTIONS: Final = ("switch", "relay", "rib", "proxy")  # in the order of their start
+NODE_SECTIONS: Final = ("switch", "relay", "rib", "proxy")  # those with a control socket
+SECTIONS: Final = (*NODE_SECTIONS, "store")  # in the order of their start
 _DOMAIN: Final = "domain"
-_ATTACHED: Final = ("rib", "proxy")
+_ATTACHED: Final = ("rib", "proxy", "store")
 
 
 def read_sections(path: Path) -> Mapping[str, Path]:
@@ -35,10 +37,10 @@ def read_sections(path: Path) -> Mapping[str, Path]:
     """
     source = read_yaml(path)
     data = _checked(source)
-    if not data.keys() & set(NODE_SECTIONS):
-        raise source.error((), f"expected at least one of the sections {', '.join(NODE_SECTIONS)}")
+    if not data.keys() & set(SECTIONS):
+        raise source.error((), f"expected at least one of the sections {', '.join(SECTIONS)}")
     found = dict[str, Path]()
-    for section in NODE_SECTIONS:
+    for section in SECTIONS:
         stated = data.get(section)
         if isinstance(stated, str):
             found[section] = path.parent / stated
@@ -84,7 +86,7 @@ def _within(marks: Mapping[KeyPath, Mark], section: str) -> dict[KeyPath, Mark]:
 def _checked(source: YamlSource) -> dict[str, Plain]:
     if not isinstance(source.data, dict):
         raise source.error((), "expected a mapping of keys to values")
-    known = (_DOMAIN, *NODE_SECTIONS)
+    known = (_DOMAIN, *SECTIONS)
     for key in source.data:
         if key not in known:
             raise source.error((key,), f"unknown key; expected one of {', '.join(known)}", at_key=True)

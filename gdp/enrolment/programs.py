@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gdp.config.machine_file import MACHINE_FILE, NODE_SECTIONS, read_sections, section_source
+from gdp.config.machine_file import MACHINE_FILE, SECTIONS, read_sections, section_source
+from gdp.config.store_config import StoreConfig
 from gdp.config.yaml_source import read_yaml
 from gdp.enrolment.member_files import MEMBER_FILE, MemberFiles
 from gdp.enrolment.member_setup import RELAY_FILE
@@ -34,8 +35,10 @@ _TITLES: Final = {
     "relay": "GDP relay: carries frames through TLS where UDP is blocked",
     "rib": "GDP RIB: stores where names are",
     "proxy": "GDP proxy: carries ROS over the overlay",
+    "store": "GDP holder: keeps the history of topics in capsules",
     "fog": "GDP fog supervisor: replaces machines of clusters that are lost",
 }
+_COMMANDS: Final = {"store": ("gdp", "store", "serve", "--config"), "fog": ("fog", "supervise", "--stay", "--site")}
 _ROS: Final = ("rclpy", "cyclonedds")
 
 
@@ -49,6 +52,7 @@ class MachineProgram:
         capabilities: those that it needs at its start.
         environment: variables that a unit has to set: those of ROS, as ``setup.bash`` exports them.
         config: file of a node that was configured by hand.
+        writes: a folder that it writes, too; None: none beyond those of the machine and its keys.
     """
 
     name: str
@@ -57,6 +61,7 @@ class MachineProgram:
     capabilities: tuple[str, ...] = ()
     environment: tuple[tuple[str, str], ...] = ()
     config: Path | None = None
+    writes: Path | None = None
 
 
 def programs_of(files: MemberFiles) -> list[MachineProgram]:
@@ -105,14 +110,15 @@ def programs_of(files: MemberFiles) -> list[MachineProgram]:
 
 def node_program(name: str, config: Path) -> MachineProgram:
     """Return the program of a node that a file configures: a section of ``machine.yaml``, or ``fog``."""
-    awaits = ("--await-iface", _AWAIT_S) if name in ("rib", "proxy") else ()
-    argv = _command(name, *(("supervise", "--stay", "--site") if name == "fog" else ("--config",)), config, *awaits)
+    awaits = ("--await-iface", _AWAIT_S) if name in ("rib", "proxy", "store") else ()
+    argv = _command(*_COMMANDS.get(name, (f"gdp-{name}", "--config")), config, *awaits)
     return MachineProgram(
         name=name,
         title=_TITLES[name],
         argv=argv,
         environment=_ros_environment() if name == "proxy" else (),
         config=config,
+        writes=StoreConfig.load(config).holds.folder.resolve() if name == "store" else None,
     )
 
 
@@ -129,9 +135,8 @@ def _ros_environment() -> tuple[tuple[str, str], ...]:
     return tuple((key, os.environ[key]) for key in _ROS_VARIABLES if os.environ.get(key))
 
 
-def _command(name: str, *words: str | Path) -> tuple[str, ...]:
+def _command(command: str, *words: str | Path) -> tuple[str, ...]:
     """Return a node's command line: its script next to the interpreter, or its module where no script is installed."""
-    command = name if name == "fog" else f"gdp-{name}"
     script = Path(sys.executable).with_name(command)
     return (str(script), *map(str, words)) if script.is_file() else _module(_module_of(command), *words)
 
@@ -188,7 +193,7 @@ def read_machine(path: Path, *, with_fog: bool = False) -> Machine:
         directory, files = path, dict(read_sections(path / MACHINE_FILE))
     else:
         directory = path
-        files = {each: path / f"{each}.yaml" for each in NODE_SECTIONS if (path / f"{each}.yaml").is_file()}
+        files = {each: path / f"{each}.yaml" for each in SECTIONS if (path / f"{each}.yaml").is_file()}
     if with_fog and (directory / FOG_FILE).is_file():
         files["fog"] = directory / FOG_FILE
     if not files:

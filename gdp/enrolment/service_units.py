@@ -26,9 +26,12 @@ _HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
 _OF_DYNAMIC_USER: Final = (
     "DynamicUser", "User", "Group", "StateDirectory", "StateDirectoryMode", "RuntimeDirectory", "WorkingDirectory",
 )  # fmt: skip
-_OF_OTHERS: Final = {  # of programs that any host may connect to, that touch no device and report nothing to systemd
+_SILENT: Final = {  # of programs that report nothing to systemd
     **dict.fromkeys(("NotifyAccess", "WatchdogSec", "TimeoutStartSec"), ""),
     "Type": "Type=exec",
+}
+_OF_OTHERS: Final = {  # of those that, too, any host may connect to, and that touch no device
+    **_SILENT,
     "RestrictAddressFamilies": "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK",
     "MemoryMax": "MemoryMax=1G",
 }
@@ -53,12 +56,15 @@ def _unit(machine: Machine, program: MachineProgram, switch: str | None) -> str:
     is_dynamic = not machine.is_member and _below(
         identity.resolve(), STATE_FOLDER, STATE_FOLDER.parent / "private" / STATE_FOLDER.name
     )
-    folders = (machine.directory, identity, Path(sys.prefix), Path(sys.base_prefix), Path(__file__))
+    own = (machine.directory, identity, *([] if program.writes is None else [program.writes]))
+    folders = (*own, Path(sys.prefix), Path(sys.base_prefix), Path(__file__))
     if hidden := [each for each in folders if _below(each.resolve(), *_PRIVATE_TMP)]:
         raise LocalError(
             f"{hidden[0]}: units have a /tmp of their own and cannot see it; move it, say to {STATE_FOLDER}"
         )
-    changes = {} if is_dynamic else dict(_of_owner(machine, identity))
+    changes = {} if is_dynamic else dict(_of_owner(machine, identity, program.writes))
+    if program.name == "store":
+        changes |= {**_SILENT, "ExecReload": ""}
     if machine.is_member:
         rights = " ".join(program.capabilities)
         changes |= {key: f"{key}={rights}" for key in ("AmbientCapabilities", "CapabilityBoundingSet")}
@@ -100,7 +106,7 @@ def _command(program: MachineProgram, packaged: str, *, is_packaged: bool) -> st
     return " ".join(quoted(each) for each in own)
 
 
-def _of_owner(machine: Machine, identity: Path) -> Mapping[str, str]:
+def _of_owner(machine: Machine, identity: Path, more: Path | None) -> Mapping[str, str]:
     """Return the lines of a node that runs as the owner of its keys, by the key of the packaged lines they replace."""
     directory = machine.directory
     status = identity.stat()
@@ -110,7 +116,8 @@ def _of_owner(machine: Machine, identity: Path) -> Mapping[str, str]:
         raise LocalError(f"{identity}: its owner {status.st_uid} is no user of this host; chown it first") from error
     runtime = "gdp-locks" if user.pw_uid == 0 else f"gdp-{user.pw_name}"
     at = "" if user.pw_uid == 0 else f"XDG_RUNTIME_DIR=%t/{runtime} "
-    writable = dict.fromkeys((directory, *([] if _below(identity, directory) else [identity])))
+    others = (each for each in (identity, more) if each is not None and not _below(each, directory))
+    writable = dict.fromkeys((directory, *others))
     return {
         **dict.fromkeys(_OF_DYNAMIC_USER, ""),
         "User": f"User={user.pw_name}",

@@ -244,6 +244,11 @@ class KeptTopic:
         is_whole = confirmed == end if windows is None else windows.next(max(confirmed, self.ring.begin), end) is None
         return is_whole and not self.is_busy
 
+    @property
+    def is_whole(self) -> bool:
+        """Return whether it is uploaded, and nothing of it was lost before."""
+        return self.is_uploaded and not self.lost and not any(each.uploader.missing_bytes for each in self._uploads)
+
     def poll_faults(self) -> list[str]:
         """Return, once, what went wrong: what a holder refused or never had, and messages that are not kept."""
         faults = [each for upload in self._uploads for each in upload.uploader.poll_faults()]
@@ -360,6 +365,8 @@ class CapsuleKeeper:
 
     def handle(self, now: Timestamps) -> None:
         """Write and upload what is there, and handle the timers that are due."""
+        if not self._clients:
+            return  # nothing is kept yet, and no holder asked
         if now.mono_s >= self._due_s:
             self.flush(now.unix_s)
             is_busy = bool(self.ended) or any(each.is_busy for each in self.topics.values())

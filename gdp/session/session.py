@@ -23,7 +23,7 @@ from gdp.session.protocol.errors import ClosedError, SessionTimeoutError
 from gdp.session.protocol.messages import Message, NameLike, Paths, Request, Response, Sign
 from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
 from gdp.session.protocol.wire import message_to_wire
-from gdp.session.settings import settings_of
+from gdp.session.settings import SessionConfig, settings_of
 from gdp.trust.advertisement import paths_value, session_value
 
 log = logging.getLogger(__name__)
@@ -329,6 +329,11 @@ def open_session(
         lease_s=lease_s,
         busy_poll_us=busy_poll_us,
     )
+    return open_node(config, timeout_s)
+
+
+def open_node(config: SessionConfig, timeout_s: float = ATTACH_S) -> Session:
+    """Open a session with these settings, as ``open_session`` does. Raises ``LocalError`` or ``AttachError``."""
     made = SessionNode(config)
     session = Session(made, ThreadDriver(made.core, made.runtime))
     try:

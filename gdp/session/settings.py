@@ -38,13 +38,14 @@ class SessionConfig(Section):
     state: Directory | None = None
     lease_s: LeaseSeconds = ADVERTISEMENT.lease_s
     busy_poll_us: int = Field(default=SPIN_US, ge=0, le=SPIN_MAX_US)
-    # keys that only proxy.yaml uses
+    # keys that only proxy.yaml and store.yaml use
     ros: object = None
     expose: object = None
     imports: object = Field(default=None, alias="import")
     record: object = None
     metrics: object = None
     sandbox: object = None
+    holds: object = None
 
     @property
     def delegation_directory(self) -> Path:

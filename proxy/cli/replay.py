@@ -67,9 +67,9 @@ def replay(
     """Replay a recording's exposed topics onto the overlay with the recorded timing.
 
     Exit 1: a message of a reliable topic was too large, had no reader, or was not confirmed by each reader; this
-    includes latched topics. Also if the overlay refused a topic, if the recording gives less than it announces, or
-    if it exceeds its memory or time. Best effort is sent without confirmation; what was dropped here, and what a
-    reader lost, is stated at the end.
+    includes latched topics. A topic with keep needs no reader once its holders have it. Also if the overlay refused a
+    topic, if the recording gives less than it announces, or if it exceeds its memory or time. Best effort is sent
+    without confirmation; what was dropped here, and what a reader lost, is stated at the end.
     """
     del columns  # its callback has done all
     limits = BagLimits(None if memory is None else memory << 20, cpu)
@@ -167,6 +167,7 @@ def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed
             best_effort=replay.sent_best_effort,
             best_effort_topics=[each.to_fields() for each in replay.best_effort()],
             unconfirmed=[asdict(each) for each in unconfirmed],
+            held=[asdict(each) for each in replay.held()],
             topics=_topic_fields(replay),
             unread=reader.unread or None,
             missing=reader.missing,
@@ -179,8 +180,8 @@ def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed
     if best_effort:
         lines.append(f"{replay.sent_best_effort} messages sent best effort, not confirmed")
     echo("; ".join(lines) or "0 messages sent")
-    for stats in best_effort:
-        echo(f"  {stats.words()}")
+    for words in [each.words() for each in best_effort] + [each.words() for each in replay.held()]:
+        echo(f"  {words}")
     if reader.unread:
         echo(f"not all of the recording could be read: {reader.unread}", err=True)
     for each in unconfirmed:

@@ -15,7 +15,7 @@ from gdp.intervals import HOUR_S, MINUTE_S
 
 _UNITS: Final = {"": 1, "B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
 _SIZE: Final = re.compile(r"(\d+)\s*([A-Za-z]*)")
-_SPAN: Final = re.compile(r"\d+(\.\d+)?s")
+_SPAN: Final = re.compile(r"^\d+(\.\d+)?s$")
 DISK_MIN_BYTES: Final = 1 << 20
 UPLINK_LOST: Final = "uplink-lost"
 _BEFORE_S, _AFTER_S = MINUTE_S, MINUTE_S / 2

@@ -83,10 +83,8 @@ class ProxyNode(Node):
             self.has_drained = True  # received messages are written
             self.runtime.stop()
 
-    def open_keeper(self, settings: ProxyConfig, held: DelegationStore) -> TopicKeeper | None:
-        """Return the keeper of the rules' topics; None: no rule has one."""
-        if not any(rule.keep for rule in settings.expose) and not any(rule.history for rule in settings.imports):
-            return None
+    def open_keeper(self, settings: ProxyConfig, held: DelegationStore) -> TopicKeeper:
+        """Return the keeper of topics; rules that need it may come with a reload."""
         folder = Path() if settings.state is None else settings.state / CAPSULES
         return TopicKeeper(self.member, self.identity, folder, held)
 

@@ -56,6 +56,27 @@ class Unconfirmed:
 
 
 @dataclass(frozen=True, slots=True)
+class Held:
+    """A topic without a reader whose holders have what its rule keeps.
+
+    Attributes:
+        messages: how many were published.
+        holders: how many there are.
+        bytes: of its capsule, with what earlier runs published.
+    """
+
+    topic: str
+    messages: int
+    holders: int
+    bytes: int
+
+    def words(self) -> str:
+        """Return it as one line."""
+        at = "its holder has" if self.holders == 1 else f"each of its {self.holders} holders has"
+        return f"{self.topic}: {self.messages} messages without a reader; {at} its capsule, {self.bytes} bytes"
+
+
+@dataclass(frozen=True, slots=True)
 class ReplayedTopic:
     """One topic of the recording that a rule exposes.
 
@@ -172,12 +193,23 @@ class Replay:
         return sum(each.publisher.losses.counts.get(LossReason.TOO_LARGE, 0) for each in self.topics)
 
     def unconfirmed(self) -> list[Unconfirmed]:
-        """Return the reliable topics with unconfirmed messages."""
-        publishers = [(each.topic, each.publisher) for each in self.topics]
+        """Return the reliable topics with messages that neither all readers nor, without a reader, all holders have."""
+        held = {each.topic for each in self.held()}
+        publishers = [(each.topic, each.publisher) for each in self.topics if each.topic not in held]
         return [
             Unconfirmed(topic, each.messages, each.acknowledgements.acknowledged, _why(each), each.losses.by_label())
             for topic, each in publishers
             if each.confirms and each.acknowledgements.acknowledged < each.messages
+        ]
+
+    def held(self) -> list[Held]:
+        """Return the topics without a reader whose holders have all that their rules keep."""
+        kept = {} if self._keeper is None else self._keeper.capsules.topics
+        return [
+            Held(each.topic, publisher.messages, len(capsule.confirmed), min(capsule.confirmed))
+            for each in self.topics
+            for publisher in [each.publisher]
+            if (capsule := kept.get(publisher.topic)) is not None and _is_unread(publisher) and capsule.is_whole
         ]
 
     def wait_for_readers(self, timeout_s: float) -> list[str]:
@@ -251,9 +283,13 @@ class Replay:
             self._report()
 
 
+def _is_unread(publisher: Publisher) -> bool:
+    return not publisher.is_wanted and publisher.losses.counts.keys() <= {LossReason.NO_READER}
+
+
 def _why(publisher: Publisher) -> str:
     """Return why some of a publisher's messages were not confirmed, as far as it is known."""
-    if not publisher.is_wanted and publisher.losses.counts.keys() <= {LossReason.NO_READER}:
+    if _is_unread(publisher):
         return "no reader"
     known = [f"{count} {_WHY[reason]}" for reason, count in publisher.losses.counts.items() if reason in _WHY]
     rest = publisher.messages - publisher.acknowledgements.acknowledged - publisher.losses.total

@@ -8,6 +8,7 @@ import pytest
 
 from gdp.config.config import RibConfig, SwitchConfig
 from gdp.config.machine_file import read_sections
+from gdp.config.store_config import HolderConfig, StoreConfig
 from gdp.errors import ConfigError
 
 
@@ -25,6 +26,18 @@ def test_a_section_has_the_defaults_of_the_machine(machine: Path) -> None:
     assert (switch.identity, switch.domain.root) == (machine.parent / "switch", machine.parent / "switch/root.crt")
     assert switch.attach == ("rib0", "proxy0")
     assert (rib.iface, rib.identity) == ("rib0", machine.parent / "rib")
+
+
+def test_a_holder_is_a_section_that_the_switch_attaches(machine: Path) -> None:
+    (machine.parent / "store").mkdir()
+    (machine.parent / "store/root.crt").touch()
+    machine.write_text("switch:\nstore: {holds: {folder: store, quota_gb: 2.5, peers: [store-b]}}\n")
+    store = StoreConfig.load(machine)
+    assert SwitchConfig.load(machine).attach == ("store0",)
+    assert (store.iface, store.identity) == ("store0", machine.parent / "store")
+    held = HolderConfig(folder=machine.parent / "store", quota_gb=2.5, peers=("store-b",))
+    assert (store.holds, held.service, held.days) == (held, "store", None)
+    assert read_sections(machine) == {"switch": machine, "store": machine}
 
 
 def test_the_common_domain_is_that_of_each_section(machine: Path) -> None:
@@ -53,6 +66,22 @@ def test_an_error_names_the_place_in_the_one_file(machine: Path, text: str, erro
     with pytest.raises(ConfigError) as raised:
         SwitchConfig.load(machine)
     assert f"{machine}{error}" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("holds", "error"),
+    [
+        ("{}", ":1:16: holds.folder: required"),
+        ("{folder: none}", ":1:25: holds.folder: no such directory"),
+        ("{folder: rib, quota_gb: 0}", "holds.quota_gb: "),
+        ("{folder: rib, quota: 1}", ":1:30: holds.quota: unknown key"),
+    ],
+)
+def test_an_error_of_a_holder_names_its_place(machine: Path, holds: str, error: str) -> None:
+    machine.write_text(f"store: {{holds: {holds}, identity: rib}}\n")
+    with pytest.raises(ConfigError) as raised:
+        StoreConfig.load(machine)
+    assert error in str(raised.value)
 
 
 @pytest.mark.parametrize("text", ["identity: switch\n", "[]\n", "switch: other.yaml\n"])

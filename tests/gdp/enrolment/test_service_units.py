@@ -39,6 +39,24 @@ def test_a_node_runs_as_the_owner_of_its_keys_and_writes_to_its_folder_alone(mac
     assert "After=gdp-robot-switch.service" in texts["gdp-robot-rib.service"]
 
 
+def test_a_holder_writes_its_capsules_and_reports_nothing_to_systemd(machine: Machine, tmp_path: Path) -> None:
+    (machine.directory / "store").mkdir()
+    (machine.directory / "store/root.crt").touch()
+    (tmp_path / "disk").mkdir()
+    (machine.directory / "machine.yaml").write_text("switch: {}\nstore: {holds: {folder: ../disk}}\n")
+    lines = service_texts(read_machine(machine.directory))["gdp-robot-store.service"].splitlines()
+    (writable,) = [line.partition("=")[2].split() for line in lines if line.startswith("ReadWritePaths=")]
+    assert {Path(each).resolve() for each in writable} == {machine.directory, tmp_path / "disk"}
+    assert {
+        "Type=exec",
+        "After=gdp-robot-switch.service",
+        "Description=GDP holder: keeps the history of topics in capsules",
+    } <= set(lines)
+    assert not any(line.startswith(("WatchdogSec", "NotifyAccess", "ExecReload")) for line in lines)
+    (command,) = [line for line in lines if line.startswith("ExecStart=")]
+    assert command.endswith(f"store serve --config {machine.directory}/machine.yaml --await-iface 60")
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
 def test_a_node_of_a_user_has_its_locks_in_a_folder_of_that_user(machine: Machine) -> None:
     user = pwd.getpwnam("daemon")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, cast
 
 import pytest
 
+from gdp.session.keeping import KeptTopic
 from proxy.bridge.sent_stats import SentStats
 from proxy.cli.replay import _report
 from proxy.node import node as proxy_node
@@ -105,6 +107,39 @@ def test_what_could_not_leave_in_time_was_not_sent_and_the_reader_knows_why(site
 def test_a_reliable_topic_is_confirmed_and_has_no_best_effort_statistics(sites: Sites, reader: BagReader) -> None:
     replay, server = replayed(sites, reader, CHATTER, 0.1)
     assert (replay.confirmed, replay.best_effort(), server.bridge.stats[0].lost) == (MESSAGES, [], 0)
+
+
+@pytest.mark.parametrize(
+    ("lost", "missing_bytes", "confirmed", "is_held"),
+    [(0, 0, (700, 700), True), (1, 0, (700, 700), False), (0, 9, (700, 700), False), (0, 0, (700, 690), False)],
+)
+def test_a_kept_topic_without_a_reader_is_confirmed_by_its_holders_if_nothing_is_missing(
+    sites: Sites, reader: BagReader, lost: int, missing_bytes: int, confirmed: tuple[int, ...], is_held: bool
+) -> None:
+    endpoint = ReplayEndpoint(reader)
+    robot = join(sites, ROBOT, endpoint, expose=[CHATTER])
+    assert sites.run(3, lambda: bool(list(robot.member.publications)))
+    node = ProxyNode.__new__(ProxyNode)  # without files and devices
+    node.member, node.runtime = robot.member, cast(Any, Runtime(sites))
+    capsule = KeptTopic.__new__(KeptTopic)
+    capsule._publisher, capsule._windows, capsule._waiting, capsule.lost = robot.stream, None, deque(), lost
+    capsule.ring = cast(Any, SimpleNamespace(end=700, is_written=True))
+    uploads = [
+        SimpleNamespace(uploader=SimpleNamespace(confirmed=each, missing_bytes=missing_bytes), is_busy=False)
+        for each in confirmed
+    ]
+    capsule._uploads = cast(Any, uploads)
+    capsules = SimpleNamespace(topics={robot.stream.topic: capsule})
+    replay = Replay(
+        node, robot.bridge, endpoint, 0.0, lambda: None, None, cast(Any, SimpleNamespace(capsules=capsules))
+    )
+    assert replay.run()
+    held, unconfirmed = replay.held(), replay.unconfirmed()
+    if is_held:
+        words = f"/chatter: {MESSAGES} messages without a reader; each of its 2 holders has its capsule, 700 bytes"
+        assert ([each.words() for each in held], unconfirmed) == ([words], [])
+    else:
+        assert (held, [(each.topic, each.why) for each in unconfirmed]) == ([], [("/chatter", "no reader")])
 
 
 def test_a_message_without_a_reader_is_no_loss_of_a_proxy() -> None:
