@@ -238,7 +238,7 @@ class KeptTopic:
 
     @property
     def is_uploaded(self) -> bool:
-        """Return whether every holder has confirmed all that was published, or stands in a window."""
+        """Return whether every holder has confirmed all that was published; of windows, all that stands in one."""
         self._publisher.seal_recorded()
         confirmed, end, windows = min(self.confirmed), self.ring.end, self._windows
         is_whole = confirmed == end if windows is None else windows.next(max(confirmed, self.ring.begin), end) is None
