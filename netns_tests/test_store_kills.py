@@ -10,10 +10,11 @@ import pytest
 from lab.process import LabProcess
 from netns_tests.history_site import TOPICS, Site, ended, history_site
 from netns_tests.session_lab import PATIENCE_S, lines_of
+from tests.draws import TIMES
 
 pytestmark = pytest.mark.netns
 
-KILLS = 4
+KILLS = 2 * TIMES
 
 
 def stored(site: Site) -> dict[str, bytes]:
