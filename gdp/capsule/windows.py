@@ -61,7 +61,7 @@ class Place(NamedTuple):
 class _Window:
     begin: int
     to_ns: int
-    end: int | None = None  # None: it goes on
+    end: int | None = None  # None: it has not ended
 
 
 class Windows:

@@ -49,6 +49,13 @@ class _Waiting(NamedTuple):
     mark: Mark | None = None
 
 
+def _asked(client: ClientCore, request: HolderRequest, now_s: float) -> Call:
+    """Return the call, begun now, that asks a holder."""
+    call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
+    client.begin(call, now_s)
+    return call
+
+
 class _Upload:
     """Upload of one topic's records to one holder.
 
@@ -90,20 +97,16 @@ class _Upload:
             except GdpError as error:
                 uploader.handle_failure(str(error), now_s)
             else:
-                self._ask(uploader.append(offset, data), client, now_s)
+                self._call = _asked(client, uploader.append(offset, data), now_s)
         if not most_bytes:
             return
         wanted = uploader.next_step(ring.begin, ring.end, now_s, windows, most_bytes, is_chosen=is_chosen)
         if isinstance(wanted, HolderRequest):
-            self._ask(wanted, client, now_s)
+            self._call = _asked(client, wanted, now_s)
         elif wanted is not None:
             self.reading = ring.read(wanted.offset, wanted.size)
             if self.reading.done():
                 self.send_next(client, now_s, windows, most_bytes, is_chosen=is_chosen)
-
-    def _ask(self, request: HolderRequest, client: ClientCore, now_s: float) -> None:
-        self._call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
-        client.begin(self._call, now_s)
 
 
 class KeptTopic:
@@ -336,9 +339,7 @@ class CapsuleKeeper:
 
     def ask(self, holder: Topic, request: HolderRequest, now_s: float) -> Call:
         """Ask a holder; the call ends later. Raises ``LocalError``: no delegation."""
-        call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
-        self._client(holder).begin(call, now_s)
-        return call
+        return _asked(self._client(holder), request, now_s)
 
     def _client(self, holder: Topic) -> ClientCore:
         client = self._clients.get(holder.name)

@@ -42,6 +42,7 @@ class CapsuleRing:
         descriptor: of the capsule.
         end: behind the last byte that is on the disk.
         begin: of the first byte here.
+        next: offset of what is appended next.
         mark: number of the last mark that ``windows`` found; 0: there is none.
         failure: why the disk does not take records; empty while it does.
 
@@ -56,7 +57,7 @@ class CapsuleRing:
         self.descriptor, self.chain, self._segments = _continued(folder, descriptor)
         self.begin, self.end = self._segments.begin, self._segments.end
         self._file_bytes = self.end - self._segments.last  # of the last file, what is under way included
-        self._next = self.end
+        self.next = self.end
         self._given_bytes = self._done_bytes = 0  # to the thread, and by it
         self.mark = 0
         self.failure = ""
@@ -74,13 +75,13 @@ class CapsuleRing:
     @property
     def wants_file(self) -> bool:
         """Return whether the next checkpoint is to begin a file."""
-        return self._file_bytes >= self.segment_bytes or not self._next
+        return self._file_bytes >= self.segment_bytes or not self.next
 
     def append(self, data: bytes, *, begins_file: bool) -> None:
         """Append whole records; ``begins_file``: the first one is a checkpoint that begins a file."""
-        at = self._next if begins_file else None
+        at = self.next if begins_file else None
         self._file_bytes = len(data) if begins_file else self._file_bytes + len(data)
-        self._next += len(data)
+        self.next += len(data)
         self._given_bytes += len(data)
         self._pool.submit(self._append, data, at)
 
@@ -91,11 +92,6 @@ class CapsuleRing:
     def is_pressed(self, confirmed: int) -> bool:
         """Return whether what no holder has confirmed fills more than a part of the ring."""
         return self.end - max(self.begin, confirmed) > self._most_bytes // _PARTS
-
-    @property
-    def next(self) -> int:
-        """Return the offset of what is appended next."""
-        return self._next
 
     def trim(self, needed: int) -> None:
         """Drop the files whose records all stand below an offset."""

@@ -115,7 +115,7 @@ def _proven(
         if data and answer.offset != begin + len(data):
             if end is not None or checkpoints > 1:
                 break
-            chain, data, parsed = Chain(capsule.name, capsule.descriptor.key), b"", 0  # it goes on behind the gap
+            chain, data, parsed = Chain(capsule.name, capsule.descriptor.key), b"", 0  # it continues behind the gap
             proven, checkpoints = 0, 0
         begin, data = answer.offset - len(data), data + answer.data
         try:

@@ -109,8 +109,6 @@ class ImportedTopic:
             keeper, history = self._context.keeper, self._flow_spec.rule.history
             if history is not None and keeper is not None:
                 self._past = keeper.join(self._flow_spec.local, self._topic, history, self._deliver_past)
-            elif history is not None:
-                self._context.faults.report(self._flow_spec.local, Fault.NOT_KEPT, "no past: restart this proxy")
             paths = paths_value(self._flow_spec.rule.paths)
             self._context.member.subscribe(self._topic, paths=paths, head_bytes=HEAD_BYTES)
         elif not ends and self.is_joined:

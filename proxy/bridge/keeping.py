@@ -30,7 +30,8 @@ from proxy.bridge.faults import Fault, Faults
 from proxy.config.history import History
 from proxy.config.keep import UPLINK_LOST, Keep
 
-_EVENTS: Final = (UPLINK_LOST, *(each.value for each in Fault if each is not Fault.NOT_KEPT))
+_FAULTS: Final = {each.value: None for each in Fault if each is not Fault.NOT_KEPT}
+_EVENTS: Final = (UPLINK_LOST, *_FAULTS)
 
 
 @dataclass(slots=True)
@@ -146,11 +147,13 @@ class TopicKeeper:
                 faults.clear(self._local[name], Fault.NOT_KEPT)
 
     def _find_events(self, faults: Faults) -> None:
-        is_attached = bool(self._when) and self._member.attachment.switch is not None
+        if not self._when:
+            return
+        is_attached = self._member.attachment.switch is not None
         if self._was_attached and not is_attached:
             self.handle_event(UPLINK_LOST, faults)
         self._was_attached = is_attached
-        counts = faults.counts if self._when.keys() & set(_EVENTS[1:]) else {}
+        counts = faults.counts if self._when.keys() & _FAULTS.keys() else {}
         for word in [word for word, count in counts.items() if count > self._fault_counts.get(word, 0)]:
             self.handle_event(word, faults)
         self._fault_counts = dict(counts)
