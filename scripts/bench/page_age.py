@@ -23,7 +23,6 @@ from machine import ROOT, RefusedError, git
 LISTS: Final = Path(__file__).with_name("pages.yaml")
 COMMITS_MAX: Final = 300
 _SCRIPTS: Final = {"experiments": "scripts/experiments", "benchmarks": "scripts/bench"}
-_DERIVED: Final = "results"  # the table of the others
 
 
 def main(words: Sequence[str] | None = None, root: Path = ROOT, lists: Path = LISTS) -> None:
@@ -54,8 +53,6 @@ def old_pages(root: Path, lists: dict[str, dict[str, list[Any]]]) -> Iterator[tu
         raise RefusedError(f"{root} is no git repository: clone it by git") from error
     for kind, scripts in _SCRIPTS.items():
         for path in sorted((root / "docs" / kind).glob("*.json")):
-            if path.stem == _DERIVED:
-                continue
             listed = lists[kind].get(path.stem)
             paths = [f"{scripts}/{path.stem}.py", *flat(listed or [])]
             reasons = (_reason(commit, paths, root) for commit in sorted(_commits(json.loads(path.read_text()))))

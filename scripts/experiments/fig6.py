@@ -21,7 +21,7 @@ from pictures import save_distributions
 from recorded import draw, segmentation_runs
 from samples import Sample, Series, least_of_two, p99
 from skeleton import Options
-from vision import require_networks
+from vision import require_network
 
 REQUESTS: Final = 300
 COMPUTED: Final = 100
@@ -61,7 +61,7 @@ def measure(options: Options) -> Report:
     wanted = {_WAIT: options.requests, _COMPUTE: options.computed}
     wanted = {_WAIT: QUICK, _COMPUTE: QUICK * options.compute} if options.quick else wanted
     if wanted[_COMPUTE]:
-        require_networks("let no servers compute: --computed 0")
+        require_network()
     chosen = [what for what, each in _SETTINGS.items() if each.is_contended or not options.quick]
     counts = {what: count for what in chosen if (count := wanted[_SETTINGS[what].role])}
     served = [Served(_TWO, TYPE, _MACHINES), Served(_ONE, TYPE, _MACHINES[:1])]

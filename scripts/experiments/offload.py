@@ -31,7 +31,6 @@ from ros_row import DIRECT_DOMAIN, READY_S, Row
 from skeleton import Options
 
 from gdp.host.cgroups import Cgroup
-from lab.cores import CORES_HELP, cores_of
 from lab.credentials import Carried
 from lab.process import LabProcess, new_run
 from lab.topology import LEFT, RIGHT, ring5
@@ -84,7 +83,7 @@ def measure(options: Options) -> Report:
     for name in names:
         machine = {"machine": asdict(machine_state())}
         tasks[name] = {
-            "network": _network(name, 1 if quick else options.rounds, quick=quick, is_limited=options.cores) | machine,
+            "network": _network(name, 1 if quick else options.rounds, quick=quick) | machine,
             "alone": _alone(name, quick=quick) | machine,
         }
     document = {"slower": SLOWER, "tasks": tasks}
@@ -98,7 +97,7 @@ def measure(options: Options) -> Report:
     )
 
 
-def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[str, object]:
+def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
     """Let every contender carry a task, in turn, round by round."""
     from offload_tasks import TASKS
 
@@ -115,9 +114,7 @@ def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[s
     at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
     found = {who: Measured() for who in CONTENDERS}
     size = 0
-    ring = ring5(MTU)
-    cores = cores_of(ring) if is_limited else None
-    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True, ring=ring, cores=cores) as row:
+    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True, ring=ring5(MTU)) as row:
         for at in range(1, rounds + 1):
             for who, middleware in CONTENDERS.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
@@ -127,7 +124,6 @@ def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[s
                 size = _trip(row, found[who], orders, at_once, direct=who not in ENCODINGS)
     return {
         "over": "the ring of three domains",
-        "cores": cores,
         "request_bytes": size,
         "rounds": rounds,
         "answered_at_once": rounds * at_once,
@@ -197,5 +193,4 @@ if __name__ == "__main__":
     parser = command_line(__doc__)
     parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
-    parser.add_argument("--cores", action="store_true", help=CORES_HELP)
     run_experiment(parser, measure)

@@ -105,5 +105,5 @@ Task: TypeAlias = "Plan | Number | Look"
 TASKS: Final[Mapping[str, Callable[[str], Task]]] = {
     "plan": Plan,
     "number": Number,
-    **{name: partial(Look, name) for name in ("detect", "segment", "count", "tag")},
+    **{name: partial(Look, name) for name in ("segment", "count", "tag")},
 }
