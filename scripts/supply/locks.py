@@ -9,7 +9,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from packaging.markers import Marker
 from packaging.utils import canonicalize_name
 
 _PIN = re.compile(r"(?P<name>[\w.\-]+)(?:\[[\w,.\- ]+\])?==(?P<version>[\w.!+\-]+)(?: *; *(?P<marker>[^\\]+?))?\Z")
@@ -32,10 +31,6 @@ class Pin:
     version: str
     marker: str
     hashes: frozenset[str]
-
-    def holds(self) -> bool:
-        """Return whether it holds for this interpreter on this machine."""
-        return not self.marker or Marker(self.marker).evaluate()
 
 
 def read_lock(path: Path) -> list[Pin]:
@@ -60,12 +55,3 @@ def read_lock(path: Path) -> list[Pin]:
         pins.append(Pin(canonicalize_name(match["name"]), match["version"], (match["marker"] or "").strip(), digests))
         joined = ""
     return pins
-
-
-def pins_here(pins: list[Pin]) -> dict[str, list[Pin]]:
-    """Return the pins that hold for this interpreter, by name."""
-    found: dict[str, list[Pin]] = {}
-    for pin in pins:
-        if pin.holds():
-            found.setdefault(pin.name, []).append(pin)
-    return found
