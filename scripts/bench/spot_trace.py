@@ -1,4 +1,4 @@
-"""Analysis of recorded spot traces: uptime, joint failures, and the simulated availability of a pool.
+"""Analysis of recorded spot traces: preemptions, and the simulated availability of a pool.
 
 Sans-I/O; randomness is an argument, a ``numpy`` generator.
 Source of the format: the traces published with "Can't Be Late: Optimizing Spot Instance Savings under Deadlines"
@@ -45,12 +45,6 @@ class Trace:
         """Return the steps at which a running machine was preempted."""
         return [int(step) for step in np.flatnonzero(self.taken[1:] & ~self.taken[:-1]) + 1]
 
-    @property
-    def uptime_s(self) -> float:
-        """Return the mean time for which a machine ran; infinite if none was ever preempted."""
-        lost = len(self.preemptions)
-        return float(np.count_nonzero(~self.taken)) * self.step_s / lost if lost else float("inf")
-
 
 @dataclass(frozen=True, slots=True)
 class Share:
@@ -59,12 +53,6 @@ class Share:
     share: float
     low: float
     high: float
-
-
-def times_independent(*steps: Steps) -> float:
-    """Return the ratio of joint occurrence to independence; ``nan`` if one of the steps is never true."""
-    expected = float(np.prod([each.mean() for each in steps]))
-    return float(np.logical_and.reduce(steps).mean()) / expected if expected else float("nan")
 
 
 def replica_down(trace: Trace, recovery_s: float) -> Steps:

@@ -32,7 +32,7 @@ from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link import score
 from thin_link.conditions import FIFOS, LOSSES, Conditions
 from thin_link.exchange import Tally
-from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
+from thin_link.line import ADDRESSES, CLOUD, ROBOT, TCP_CONTROL, Used, open_line, thin_link_lab
 from thin_link.score import LINK_COLUMNS, STREAM_COLUMNS, link_figures, merged, stream_figures, whole_share
 from thin_link.systems import SYSTEMS, System, run_window, start_role
 from thin_link.traffic import CAMERA_BYTES, carried_s, streams, wire_bytes
@@ -52,6 +52,7 @@ GRID: Final = (  # rate, round trip in ms, loss, FIFO
 RECORDED: Final = ("Verizon-LTE-short", 60.0, "0", "second")
 RTTS_MS: Final = (10.0, 60.0, 200.0)
 WARM_UP_S: Final = 3.0
+SEED: Final = 1  # of the losses
 READY_S: Final = 30.0
 RAW_CAMERA_BITS_S: Final = 50e6  # from this rate on, the camera is not compressed
 _FIGURES: Final = {"cmd_vel": 15.0, "tf": 15.0}  # asked: age p99 over idle, ms
@@ -83,7 +84,7 @@ def links_of(options: Options) -> list[Conditions]:
     if any(chosen):
         words = list(product(*(each or [usual] for each, usual in zip(chosen, GRID[0], strict=True))))
     try:
-        return [Conditions.of(*each, seed=options.seed, traces=options.traces) for each in words]
+        return [Conditions.of(*each, seed=SEED, traces=options.traces) for each in words]
     except LocalError as error:
         raise RefusedError(str(error)) from error
 
@@ -175,7 +176,7 @@ def measure(options: Options) -> Outcome:
     for number in range(1, options.rounds + 1):
         for link in links:
             with new_run() as run:
-                lab = thin_link_lab(run, tcp_control=options.tcp_control)
+                lab = thin_link_lab(run)
                 for trial in trials_of(lab, link, options, recorder.rounds):
                     recorder.attempt(trial, number, options.rounds)
     over = recorder.rounds
@@ -187,8 +188,8 @@ def measure(options: Options) -> Outcome:
         {
             "seconds of each figure": options.seconds,
             "warm-up, s": WARM_UP_S,
-            "seed": options.seed,
-            "TCP of Zenoh": options.tcp_control,
+            "seed": SEED,
+            "TCP of Zenoh": TCP_CONTROL,
             "FIFO up, B": [link.up.fifo_bytes for link in links],
             "camera, B": [CAMERA_BYTES[camera_of(link, options.camera)] for link in links],
             "trouble": recorder.notes or "none",
@@ -208,10 +209,6 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--camera", choices=("auto", *CAMERA_BYTES), default="auto", help="raw from 50 Mbit/s on: auto")
     parser.add_argument(
         "--traces", type=Path, default=DATA / "uplinks", help="folder of recordings (default: %(default)s)"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="of the losses (default: %(default)s)")
-    parser.add_argument(
-        "--tcp-control", default="cubic", help="congestion control under Zenoh's TLS (default: %(default)s)"
     )
     parser.add_argument("--no-tcp", dest="tcp", action="store_false", help="no TCP flow: half the time")
     return parser

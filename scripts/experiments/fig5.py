@@ -22,7 +22,7 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Field, Served, Work
 from machine import DATA, RefusedError, data_folder
-from pictures import save_distributions
+from plot import save_distributions
 from recorded import FASTER, LIMIT_S, draw, load
 from samples import Sample, Series, least_of_two, p99
 from skeleton import Options

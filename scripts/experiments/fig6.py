@@ -17,7 +17,7 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from frames import TYPE
-from pictures import save_distributions
+from plot import save_distributions
 from recorded import draw, segmentation_runs
 from samples import Sample, Series, least_of_two, p99
 from skeleton import Options
@@ -58,7 +58,7 @@ _SETTINGS: Final = {
 
 def measure(options: Options) -> Report:
     """Segment frames while a second client contends for one replica."""
-    wanted = {_WAIT: options.requests, _COMPUTE: options.computed}
+    wanted = {_WAIT: REQUESTS, _COMPUTE: options.computed}
     wanted = {_WAIT: QUICK, _COMPUTE: QUICK * options.compute} if options.quick else wanted
     if wanted[_COMPUTE]:
         require_network()
@@ -98,7 +98,6 @@ def _times() -> dict[str, list[float]]:
 
 if __name__ == "__main__":
     parser = command_line(__doc__)
-    parser.add_argument("--requests", type=int, default=REQUESTS, help="while servers wait (default: %(default)s)")
     parser.add_argument("--computed", type=int, default=COMPUTED, help="while they compute (default: %(default)s)")
     parser.add_argument("--compute", action="store_true", help="with --quick: let servers compute, too")
     run_experiment(parser, measure)

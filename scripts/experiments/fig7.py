@@ -12,7 +12,7 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from frames import TYPE
-from pictures import save_distributions
+from plot import save_distributions
 from samples import Sample, Series
 from skeleton import Options
 
@@ -29,7 +29,7 @@ _NEAR: Final = "m1"
 
 def measure(options: Options) -> Report:
     """Detect objects while one replica's link is slow: one server against two replicas."""
-    count = QUICK if options.quick else options.requests
+    count = QUICK if options.quick else REQUESTS
     machines = (_NEAR, *_LINKS)
     served = [Served(f"/detect/{each}", TYPE, (each,)) for each in machines]
     served += [Served(f"/detect/both/{each}", TYPE, (_NEAR, each)) for each in _LINKS]
@@ -76,6 +76,4 @@ def _compared(found: dict[str, list[Sample]]) -> tuple[dict[str, list[Sample]], 
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__)
-    parser.add_argument("--requests", type=int, default=REQUESTS, help="of each case (default: %(default)s)")
-    run_experiment(parser, measure)
+    run_experiment(command_line(__doc__), measure)

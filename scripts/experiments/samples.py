@@ -19,7 +19,7 @@ class Series:
     """Calls of several services in turn; each round of them carries the same request.
 
     Args:
-        task: a kind of request in ``tasks.TASKS``.
+        task: a kind of request in ``tasks.task_of``.
         count: of calls in all.
         machines: each has answered a call before the series begins.
         patience_s: after which a call has failed.

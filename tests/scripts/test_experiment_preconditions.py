@@ -22,7 +22,6 @@ from machine import MachineState, machine_state
 from report import Rounds, write_json
 from skeleton import Outcome, command_line, parse, perform
 
-import make_catalog
 from tests.pages import ROOT
 
 DATA = ROOT / "scripts" / "data"
@@ -75,7 +74,6 @@ def test_a_command_without_its_data_says_which_file_and_how_to_get_it(
     said = ends(lambda: availability.main(["--out", str(tmp_path / "out")]))
     assert f"no {tmp_path}/spot/aws_*.json: git checkout -- scripts/data restores it" in said
     assert not list((tmp_path / "out").iterdir())
-    assert "spot-advisor-data.json" in ends(make_catalog.main)
     monkeypatch.setattr("sys.argv", ["uplink.py", "--quick", "--rates", "Radio", "--traces", str(tmp_path)])
     assert f"no recording {tmp_path}/Radio.up" in ends(lambda: perform(parse(uplink.arguments()), uplink.measure))
 
@@ -107,7 +105,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
 ) -> None:
     on(monkeypatch, QUIET)
-    monkeypatch.setattr(table1, "bills", lambda region: pytest.fail("measured"))
+    monkeypatch.setattr(table1, "applications", lambda: pytest.fail("measured"))
     (tmp_path / "file").touch()
     said = ends(lambda: table1.main(["--out", str(tmp_path / "file" / "out")]))
     assert f"{tmp_path}/file/out cannot be written (Not a directory): choose another folder" in said
@@ -117,7 +115,7 @@ def test_a_busy_machine_writes_no_page_but_runs_quickly_or_marks_its_rows(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
 ) -> None:
     on(monkeypatch, BUSY)
-    monkeypatch.setattr("pictures.save", lambda figure, path: path.touch())
+    monkeypatch.setattr("plot.save", lambda figure, path, **_: path.touch())
     said = ends(lambda: availability.main(["--out", str(tmp_path)]))
     assert "the load before, 1.50, exceeds half of 2 cores" in said
     assert "--allow-load" in said

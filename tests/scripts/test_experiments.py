@@ -112,7 +112,7 @@ def test_an_answer_is_judged_by_what_the_task_asked_for() -> None:
     needs("scipy", "rcl_interfaces")
     import numpy as np
     from frames import answer_of, text_of
-    from tasks import TASKS
+    from tasks import task_of
     from vision import SHAPE, Scene
 
     words = Scene.draw(3).words
@@ -124,7 +124,7 @@ def test_an_answer_is_judged_by_what_the_task_asked_for() -> None:
         "count": ({"words": len(words)}, {"words": 0}),
     }
     for name, both in answers.items():
-        task = TASKS[name]("")
+        task = task_of(name)
         judged = [task.judge(3, answer_of({"machine": "m1", "worked_s": 0.1, **said})) for said in both]
         assert [each.is_right for each in judged] == [True, False], name
 
@@ -140,7 +140,7 @@ def test_a_figure_that_computes_refuses_without_the_network(
     monkeypatch.setattr(vision, "find_spec", lambda _: None)
     parser = command_line("")
     parser.add_argument("--compute", action="store_true")
-    parser.set_defaults(requests=2, computed=2)
+    parser.set_defaults(computed=2)
     with pytest.raises(SystemExit) as ended:
         run_experiment(parser, fig6.measure, ["--quick", "--compute"])
     assert ended.value.code == 2
@@ -265,7 +265,7 @@ def test_the_least_of_two_recorded_runs_gains_by_how_rare_the_long_ones_are() ->
 def test_a_request_is_lost_only_while_all_its_machines_stay_down() -> None:
     needs("matplotlib")
     from outages import share_unanswered
-    from pictures import Span
+    from plot import Span
 
     one, other = [Span("m1", 1.0, 4.0)], [Span("m2", 3.0, 8.0)]
     assert share_unanswered([one], 10.0, 0.0) == pytest.approx(0.3, abs=0.01)

@@ -75,15 +75,6 @@ def test_the_oldest_part_of_a_page_counts(repository: Repository) -> None:
     assert repository.old() == {}
 
 
-def test_a_page_is_old_after_too_many_commits(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_age, "COMMITS_MAX", 2)
-    repository.page(repository.commit("gdp/switch/b.py"))
-    repository.commit("gdp/switch/b.py", "1")
-    assert repository.old() == {}
-    repository.commit("gdp/switch/b.py", "2")
-    assert repository.old() == {"experiments/fig": "3 commits old"}
-
-
 @pytest.mark.parametrize(
     ("commit", "reason"),
     [

@@ -11,7 +11,6 @@ from spot_trace import (
     pool_down,
     replica_down,
     share_with_interval,
-    times_independent,
 )
 
 from gdp.errors import LocalError
@@ -25,11 +24,9 @@ def drawn(steps: object) -> str:
     return "".join("1" if each else "0" for each in np.asarray(steps))
 
 
-def test_uptime_is_the_mean_run_before_a_preemption() -> None:
-    recorded = trace("0001100011")
-    assert recorded.preemptions == [3, 8]
-    assert recorded.uptime_s == 30.0
-    assert trace("000").uptime_s == float("inf")
+def test_a_machine_is_preempted_where_none_is_available_any_more() -> None:
+    assert trace("0001100011").preemptions == [3, 8]
+    assert trace("000").preemptions == []
 
 
 def test_a_replica_that_stays_is_down_until_it_has_recovered() -> None:
@@ -48,12 +45,6 @@ def test_a_pool_that_moves_is_down_while_no_zone_has_capacity_and_until_it_has_r
 
 def test_none_is_up_when_all_are_down() -> None:
     assert drawn(none_up([trace("0110").taken, trace("0011").taken])) == "0010"
-
-
-def test_what_always_happens_together_is_one_over_its_share_times_as_frequent() -> None:
-    steps = trace("1000").taken
-    assert times_independent(steps, steps) == 4.0
-    assert times_independent(steps, trace("1010").taken) == 2.0
 
 
 def test_the_interval_holds_the_share_and_narrows_with_the_length() -> None:
