@@ -15,7 +15,7 @@ import argparse
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -118,7 +118,7 @@ class Report:
     ) -> Report:
         """Return the report on latencies; ``groups``: samples by their label in the table."""
         rows = [
-            (label, str(found.count), str(found.failed), *(number_text(1e3 * each) for each in found.times_s))
+            (label, str(found.count), str(found.failed), *(number_text(1e3 * each) for each in astuple(found)[2:]))
             for label, found in ((label, Summary.of(samples)) for label, samples in groups.items())
         ]
         document = {

@@ -6,7 +6,6 @@ sudo .venv/bin/python scripts/experiments/fig4.py --quick          # few request
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Final
 
 from asking import Asking
@@ -34,6 +33,10 @@ def measure(options: Options) -> Report:
     found = {form: _ask(form, count) for form in FORMS}
     figures = {form: of for form, (_, of) in found.items()}
     findings = [Finding(f"{form}: {COUNTED[at]}", each) for form, of in figures.items() for at, each in enumerate(of)]
+    panels = [
+        Panel(what, "kB a request", [Bar(form, of[at] / 1e3, ours=form != DIRECT) for form, of in figures.items()])
+        for at, what in enumerate(COUNTED)
+    ]
     one, most = f"1/{REPLICAS}", (1 + _EXTRA_SHARE) / REPLICAS
     for form in list(FORMS)[1:]:
         share = figures[form][0] / figures[DIRECT][0]
@@ -43,7 +46,7 @@ def measure(options: Options) -> Report:
         {form: samples for form, (samples, _) in found.items()},
         findings,
         {"replicas": REPLICAS, "requests": count},
-        lambda path, title: save_bars(path, title, "", _panels(figures)),
+        lambda path, title: save_bars(path, title, "", panels),
     )
 
 
@@ -58,13 +61,6 @@ def _ask(form: str, count: int) -> tuple[list[Sample], list[float]]:
                 samples = list(asking)
             after = cluster.received_bytes()
     return samples, [(now - then) / (count + _WARM_UP) for then, now in zip(before, after, strict=True)]
-
-
-def _panels(figures: Mapping[str, Sequence[float]]) -> list[Panel]:
-    return [
-        Panel(what, "kB a request", [Bar(form, of[at] / 1e3, ours=form != DIRECT) for form, of in figures.items()])
-        for at, what in enumerate(COUNTED)
-    ]
 
 
 if __name__ == "__main__":

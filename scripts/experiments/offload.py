@@ -75,7 +75,7 @@ def measure(options: Options) -> Report:
     names = [_QUICK] if quick else list(COMPUTED)
     for name in names:
         TASKS[name]()  # so that missing data are reported first
-    tasks: dict[str, dict[str, object]] = {}
+    tasks = {}
     for name in names:
         machine = {"machine": asdict(machine_state())}
         tasks[name] = {

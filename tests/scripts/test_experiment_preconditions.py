@@ -14,7 +14,6 @@ from pathlib import Path
 
 import availability
 import machine
-import papers
 import pytest
 import table1
 import uplink
@@ -46,7 +45,7 @@ def ends(capsys: pytest.CaptureFixture[str]) -> Ends:
 
 def on(monkeypatch: pytest.MonkeyPatch, state: MachineState) -> None:
     """Let experiments and benches find a machine in this state."""
-    for module in ("experiment", "skeleton", "papers"):
+    for module in ("experiment", "skeleton"):
         monkeypatch.setattr(f"{module}.machine_state", lambda: state)
 
 
@@ -186,26 +185,3 @@ def test_a_tree_without_git_writes_no_page_but_runs_quickly(tmp_path: Path) -> N
     assert f"{tree} is no git repository: clone it by git, or use --quick" in line
     assert not (tree / "docs" / "experiments" / "table1.md").exists()
     assert subprocess.run([*argv, "--quick"], env=environment, capture_output=True, check=False).returncode == 0
-
-
-def test_a_failed_experiment_fails_the_whole_and_the_others_still_run(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    on(monkeypatch, QUIET)
-    monkeypatch.setattr("papers.data_folder", lambda *_: tmp_path)
-    scripts, out = tmp_path / "scripts", tmp_path / "out"
-    scripts.mkdir()
-    for name in papers.EXPERIMENTS:
-        made = f"import pathlib, sys; pathlib.Path(sys.argv[2], '{name}.json').touch()"
-        (scripts / f"{name}.py").write_text("raise SystemExit(1)" if name == "fig9" else made)
-    with pytest.raises(SystemExit, match=r"failed: fig9\Z"):
-        papers.main(["--folder", str(out)], scripts)
-    assert {path.stem for path in out.iterdir()} == {*papers.EXPERIMENTS} - {"fig9"}
-
-
-def test_the_papers_are_not_begun_on_a_busy_machine(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
-) -> None:
-    on(monkeypatch, BUSY)
-    assert "exceeds half of 2 cores" in ends(lambda: papers.main(["--folder", str(tmp_path)]))
-    assert not list(tmp_path.iterdir())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from spot_trace import (
     Trace,
     none_up,
@@ -12,8 +11,6 @@ from spot_trace import (
     replica_down,
     share_with_interval,
 )
-
-from gdp.errors import LocalError
 
 
 def trace(text: str, zone: str = "a") -> Trace:
@@ -53,9 +50,3 @@ def test_the_interval_holds_the_share_and_narrows_with_the_length() -> None:
     for each in (short, long):
         assert each.low <= each.share <= each.high
     assert long.high - long.low < short.high - short.low
-
-
-@pytest.mark.parametrize("document", [{}, {"metadata": {"gap_seconds": 0}, "data": [1]}, [], "x"])
-def test_what_is_no_trace_is_refused(document: object) -> None:
-    with pytest.raises(LocalError, match="not a trace"):
-        Trace.from_document("a", document)
