@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from experiment import PAPERS
 from machine import MachineState
-from page_text import PAPERS
 from plot import Bar, Panel
 from report import markdown_table, percentile
 

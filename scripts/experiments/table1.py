@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Final
 
-from experiment import Report, Rows, command_line, run_experiment
-from page_text import PAPERS
+from experiment import PAPERS, Report, Rows, command_line, run_experiment
 from plot import Bar, Panel, save_bars
 from skeleton import Options
 

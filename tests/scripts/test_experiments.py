@@ -284,7 +284,7 @@ def test_outages_last_and_come_as_often_as_they_are_drawn_to() -> None:
 
 
 def test_a_text_has_one_line_for_each_paragraph_and_each_item_of_a_list() -> None:
-    from page_text import text_of
+    from experiment import text_of
 
     figures = {"up_s": 9.0, "down_s": 3.0, "patience_s": 0.5}
     lines = text_of("outages", latencies="rows", findings="more", **figures).splitlines()

@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 import release
 import sbom
-from locks import LockError, Pin, read_lock
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from sbom import LockError, Pin, read_lock
 
 from gdp.stores.issue import make_owner
 from tests.draws import IS_LONG
