@@ -24,7 +24,7 @@ from gdp.config.schema import Section
 from gdp.crypto.keys import SigningKey
 from gdp.errors import ConfigError
 from internet_demo import cli as internet_demo
-from memory_demo import cli as memory_demo
+from memory_demo import __main__ as memory_demo
 from proxy.cli import delegate, proxy, replay
 from proxy.config.config import ProxyConfig
 from ring import cli as ring
