@@ -68,6 +68,7 @@ _DECODER: Final = "from proxy.recordings.child import main"  # a line of its cod
 _PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet_demo", "fog_demo", "lab")
 _KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
 _SETTINGS: Final = ("PYTHON", "LD_", "COVERAGE")
+_LIBRARIES: Final = "LD_LIBRARY_PATH"
 _SPACES: Final = ("ipc", "mnt", "pid", "user", "uts")
 _LIMITS: Final = tuple(value for name, value in vars(resource).items() if name.startswith("RLIMIT_"))
 _REQUEST_BYTES: Final = 1 << 18
@@ -459,8 +460,13 @@ def _show(argv: Sequence[str], environment: Mapping[str, str]) -> None:
 
 
 def _settings(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables that an interpreter or its libraries read before a program can change them."""
-    return {name: value for name, value in environment.items() if name.startswith(_SETTINGS) and name not in _KEPT}
+    """Return the variables that an interpreter or its libraries read before a program can change them.
+
+    A folder of libraries that does not exist is no setting: OpenCV adds one where a process imports it.
+    """
+    found = {name: value for name, value in environment.items() if name.startswith(_SETTINGS) and name not in _KEPT}
+    folders = [each for each in found.pop(_LIBRARIES, "").split(os.pathsep) if os.path.isdir(each)]
+    return {**found, **({_LIBRARIES: os.pathsep.join(folders)} if folders else {})}
 
 
 def _place() -> list[str]:

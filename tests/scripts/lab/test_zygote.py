@@ -167,8 +167,7 @@ def test_what_is_not_plainly_a_program_of_the_project_is_executed(argv: list[str
     assert Program.from_argv(argv) is None
 
 
-def test_another_copy_of_the_project_is_executed(tmp_path: Path) -> None:
-    forked = Zygote.start()  # earlier tests may have changed what that of the session was born into
+def test_another_copy_of_the_project_is_executed(forked: Zygote, tmp_path: Path) -> None:
     (tmp_path / "gdp").mkdir()
     program = Program.from_argv([sys.executable, "-m", "gdp.cli.gdp"])
     assert program is not None
@@ -176,3 +175,15 @@ def test_another_copy_of_the_project_is_executed(tmp_path: Path) -> None:
     assert not forked.can_run(program, dict(os.environ), tmp_path)
     assert not forked.can_run(program, {**os.environ, "PYTHONPATH": str(tmp_path)}, ROOT)
     assert not forked.can_run(program, {**os.environ, "PYTHONHASHSEED": "7"}, ROOT)
+    own = os.environ.get("LD_LIBRARY_PATH", "")
+    assert not forked.can_run(program, {**os.environ, "LD_LIBRARY_PATH": f"{tmp_path}{os.pathsep}{own}"}, ROOT)
+
+
+@pytest.mark.skipif(Popen.zygote is None, reason="this session executes programs")
+def test_no_import_of_a_test_makes_the_session_execute_its_programs(tmp_path: Path) -> None:
+    program = Program.from_argv([sys.executable, "-m", "gdp.cli.gdp"])
+    assert program is not None
+    assert Popen.zygote is not None
+    assert Popen.zygote.can_run(program, dict(os.environ), ROOT), "what all tests import has changed its surroundings"
+    missing = f"{tmp_path / 'missing'}{os.pathsep}{os.environ.get('LD_LIBRARY_PATH', '')}"  # as cv2 does
+    assert Popen.zygote.can_run(program, {**os.environ, "LD_LIBRARY_PATH": missing}, ROOT)
