@@ -64,8 +64,10 @@ _PRELOADED: Final = (
 _STARTERS: Final = {"fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo", "up", "join", "domain"}
 _NATIVE: Final = {"rclpy", "cyclonedds"}  # they leave their network in destructors
 _PLAIN: Final = re.compile(r"(?:[\w ./:,=@+%-]|'[^']*')+")  # a shell takes it for words
-_DECODER: Final = "from proxy.recordings.child import main"  # a line of its code: Python runs it by ``-c``
 _PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet_demo", "fog_demo", "lab")
+_DECODER: Final = re.compile(r"^from proxy\.recordings\.child import main$", re.MULTILINE)  # Python runs it by ``-c``
+# On a machine of a laboratory such code is a program; elsewhere it may be about what an import does.
+_OURS: Final = re.compile(rf"^(?:from|import) (?:{'|'.join(_PACKAGES)})\b", re.MULTILINE)
 _KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
 _SETTINGS: Final = ("PYTHON", "LD_", "COVERAGE")
 _LIBRARIES: Final = "LD_LIBRARY_PATH"
@@ -123,7 +125,7 @@ class Program:
             return replace(program, file=words[0]) if Path(words[0]).name in _scripts() else None
         if words[1:2] == ["-m"] and len(words) > 2 and words[2].partition(".")[0] in _PACKAGES:
             return replace(program, module=words[2])
-        if words[1:2] == ["-c"] and len(words) > 2 and _DECODER in words[2].splitlines():
+        if words[1:2] == ["-c"] and len(words) > 2 and (_DECODER if not spaces else _OURS).search(words[2]):
             return replace(program, code=words[2])
         if len(words) > 1 and words[1].endswith(".py") and Path(words[1]).resolve().is_relative_to(ROOT):
             return replace(program, file=words[1])

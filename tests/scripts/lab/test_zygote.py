@@ -158,6 +158,7 @@ def test_it_dies_with_its_caller(how: str) -> None:
     [
         ["sleep", "0"],
         [sys.executable, "-c", "pass"],
+        [sys.executable, "-c", "import gdp"],
         [sys.executable, "-I", "-m", "gdp.cli.gdp"],
         ["setpriv", "--reuid", "1", sys.executable, "-m", "gdp.cli.gdp"],
         ["/usr/bin/python3", "-m", "gdp.cli.gdp"],
@@ -177,6 +178,14 @@ def test_another_copy_of_the_project_is_executed(forked: Zygote, tmp_path: Path)
     assert not forked.can_run(program, {**os.environ, "PYTHONHASHSEED": "7"}, ROOT)
     own = os.environ.get("LD_LIBRARY_PATH", "")
     assert not forked.can_run(program, {**os.environ, "LD_LIBRARY_PATH": f"{tmp_path}{os.pathsep}{own}"}, ROOT)
+
+
+def test_code_that_imports_the_project_is_forked_on_a_machine_of_a_laboratory() -> None:
+    entered = ["nsenter", "--net=/run/netns/s1", "--", sys.executable, "-c"]
+    program = Program.from_argv([*entered, "import sys\nfrom gdp import names"])
+    assert program is not None
+    assert program.code.startswith("import sys")
+    assert Program.from_argv([*entered, "import gdprint"]) is None
 
 
 @pytest.mark.skipif(Popen.zygote is None, reason="this session executes programs")
