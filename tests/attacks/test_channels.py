@@ -7,7 +7,7 @@ from gdp.frame.codec import Header, Kind, encode
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
 from lab.simulation import Simulation
-from tests.journeys.flows import SERVER, Tap, advertise, flowing, row
+from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
 
 
@@ -35,7 +35,7 @@ def of_rib(tap: Tap) -> list[bytes]:
 
 
 def test_a12_a13_recorded_questions_and_advertisements_draw_no_more_than_their_own_bytes() -> None:
-    world = row(lease_s=60.0)  # nothing is renewed during this time
+    world = ring(lease_s=60.0)  # nothing is renewed during this time
     node, there, back = at_rib(world)
     flow = flowing(world)
     for number in range(5):
@@ -54,7 +54,7 @@ def test_a12_a13_recorded_questions_and_advertisements_draw_no_more_than_their_o
 
 
 def test_a39_a_rib_that_restarted_takes_no_advertisement_that_a_stranger_recorded() -> None:
-    world = row()
+    world = ring()
     node, there, _ = at_rib(world)
     flow = flowing(world)
     world.network.run(1)
@@ -76,8 +76,8 @@ def test_a39_a_rib_that_restarted_takes_no_advertisement_that_a_stranger_recorde
 
 
 def test_an_old_negative_response_delays_no_message() -> None:
-    world = row()
-    tap = Tap("nuc2", "nuc5")
+    world = ring()
+    tap = Tap("nuc4", "nuc5")
     world.network.taps.append(tap)
     flow = flowing(world)
     name = Name(bytes(range(32)))

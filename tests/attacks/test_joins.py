@@ -13,7 +13,7 @@ from gdp.frame.codec import Kind
 from gdp.switch.core import SwitchCore
 from gdp.switch.trees import Tree
 from lab.simulation import Simulation
-from tests.journeys.flows import SERVER, Flow, flowing, row
+from tests.journeys.flows import SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import counted, still_flows
 
 
@@ -32,7 +32,7 @@ def aside(world: Simulation, flow: Flow) -> tuple[SwitchCore, Tree, Neighbour, I
 
 @pytest.mark.parametrize("proof", ["none", "of the true place", "of another topic"])
 def test_x03_a_join_that_leads_elsewhere_moves_no_tree(proof: str) -> None:
-    world = row()
+    world = ring()
     flow = flowing(world)
     home, tree, liar, identity = aside(world, flow)
     (label,) = (each for each, machine in world.switches.items() if machine is home)
@@ -68,7 +68,7 @@ def test_x03_a_join_that_leads_elsewhere_moves_no_tree(proof: str) -> None:
 
 
 def test_x03_a_genuine_advertisement_of_the_publisher_says_where_it_is_only_under_its_own_number() -> None:
-    world = row()
+    world = ring()
     flow = flowing(world)
     home, tree, liar, identity = aside(world, flow)
     (label,) = (each for each, machine in world.switches.items() if machine is home)

@@ -10,7 +10,7 @@ from gdp.frame.codec import Kind
 from gdp.names import Name
 from gdp.switch.core import SwitchCore
 from gdp.trust.right import Right
-from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, row
+from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 from tests.journeys.services import Party, outlive
 from tests.journeys.test_attacks import mac_of, still_flows
 
@@ -29,7 +29,7 @@ def recorded_life(flow: Flow) -> Tap:
 
 @pytest.mark.parametrize("reliable", [True, False])
 def test_a10_commands_of_an_hour_ago_are_not_delivered_to_a_restarted_reader(reliable: bool) -> None:
-    world = row()
+    world = ring()
     tap = Tap("nuc5", SERVER)
     world.network.taps.append(tap)
     flow = flowing(world, reliable=reliable)
@@ -55,7 +55,7 @@ def test_a10_commands_of_an_hour_ago_are_not_delivered_to_a_restarted_reader(rel
 
 
 def test_a11_a_request_of_ten_minutes_ago_is_not_delivered_to_a_restarted_server() -> None:
-    world = row()
+    world = ring()
     tap = Tap("nuc5", SERVER)
     world.network.taps.append(tap)
     server, client = Party(world, SERVER, Right.SERVE), Party(world, ROBOT, Right.CALL)
@@ -78,8 +78,8 @@ def test_a11_a_request_of_ten_minutes_ago_is_not_delivered_to_a_restarted_server
 
 
 def test_a09_an_old_gone_of_a_publisher_that_came_back_silences_no_topic() -> None:
-    world = row()
-    tap = Tap("nuc2", "nuc5")
+    world = ring()
+    tap = Tap("nuc4", "nuc5")
     world.network.taps.append(tap)
     flow = flowing(world)
     world.members[ROBOT].leave()
@@ -106,7 +106,7 @@ def test_a09_an_old_gone_of_a_publisher_that_came_back_silences_no_topic() -> No
 
 @pytest.mark.parametrize("right", [Right.PUBLISH, Right.READ])
 def test_a39_a_recorded_advertisement_of_what_was_withdrawn_is_not_taken_again(right: Right) -> None:
-    world = row()
+    world = ring()
     flow = flowing(world)
     member = world.members[ROBOT]
     topic = world.topic("/withdrawn", member, [right])
@@ -138,7 +138,7 @@ def test_a39_a_recorded_advertisement_of_what_was_withdrawn_is_not_taken_again(r
 
 
 def test_a39_a_recorded_advertisement_of_an_earlier_life_of_an_attached_node_is_not_taken() -> None:
-    world = row()
+    world = ring()
     tap = Tap(ROBOT, "nuc1")
     world.network.taps.append(tap)
     flow = flowing(world)

@@ -19,7 +19,7 @@ from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from lab.simulation import Simulation
-from tests.journeys.flows import ROBOT, flowing, row
+from tests.journeys.flows import ROBOT, flowing, ring
 from tests.journeys.test_attacks import control, mac_of, still_flows
 
 PADDINGS = (ADVERTISEMENT_MAX_BYTES - 2_000, 12_000, 13_000, 14_000, 15_000)
@@ -45,7 +45,7 @@ def say(world: Simulation, kind: Kind, wire: bytes, number: int) -> None:
 
 @pytest.mark.parametrize("kind", [Kind.ADVERTISE, Kind.WITHDRAW])
 def test_a01_a02_a40_no_advertisement_or_withdrawal_of_any_size_ends_a_switch_or_a_rib(kind: Kind) -> None:
-    world = row()
+    world = ring()
     flow = flowing(world)
     robot = world.identities[ROBOT]
     wire = sign(StatementType.WITHDRAW, {"n": robot.name, "right": "read", "s": 1 << 40}, robot.name, robot.key)
@@ -72,7 +72,7 @@ def test_a01_a02_a40_no_advertisement_or_withdrawal_of_any_size_ends_a_switch_or
 
 
 def test_a70_a_link_state_of_a_rib_called_zero_is_malformed() -> None:
-    world = row()
+    world = ring()
     flow = flowing(world)
     liar = world.identities["nuc2"]
     state = LinkState(
@@ -94,7 +94,7 @@ def test_a70_a_link_state_of_a_rib_called_zero_is_malformed() -> None:
 
 @pytest.mark.parametrize("sequence", [(1 << 64) - 1, 1 << 60])
 def test_a23_a71_an_ack_of_a_giant_number_ends_no_proxy(sequence: int) -> None:
-    world = row()
+    world = ring()
     flow = flowing(world)
     rib, robot = world.identities["rib:school"], world.members[ROBOT]
     ack = AdvertiseAck(flow.topic.name, robot.name, DropReason.STALE, sequence)
@@ -106,7 +106,7 @@ def test_a23_a71_an_ack_of_a_giant_number_ends_no_proxy(sequence: int) -> None:
 
 
 def test_a64_a_link_state_of_more_than_fits_is_cut_and_ends_no_switch() -> None:
-    world = row()
+    world = ring()
     nuc1 = world.identities["nuc1"]
 
     def names(count: int) -> list[Name]:
@@ -146,7 +146,7 @@ def contained() -> Iterator[None]:
 def test_an_error_of_ours_is_contained_counted_logged_once_and_its_sender_quarantined(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    world = row()
+    world = ring()
     flow = flowing(world)
     nuc1 = world.switches["nuc1"]
 

@@ -51,7 +51,7 @@ def test_the_trees_of_all_switches_lead_from_the_publisher_to_the_reader() -> No
     while at != reader:
         (at,) = steps[at]
         passed += 1
-    assert passed == 5
+    assert passed == 3
     flow.outlive()
 
 
