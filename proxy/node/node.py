@@ -17,7 +17,7 @@ from gdp.client.participant import Participant, Topic
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import GOODBYE_S, LINGER_S, TICK_S
-from gdp.links.uplink import open_uplink
+from gdp.links.uplink import load_plane, open_uplink
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_settings, load_member
@@ -52,7 +52,7 @@ class ProxyNode(Node):
         member = load_member(config.identity, config.domain, Role.PROXY)
         super().__init__("proxy", member, config, stack, state_folder=config.state)
         self.member = Participant(self.identity, self.policy, fresh_settings(config.lease_s))
-        plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
+        plane = stack.enter_context(open_uplink(config.iface, load_plane(config.data_plane, stack)))
         self.runtime = Runtime(self.member, plane, spin_s=config.busy_poll_us / 1e6)
         self.state = ProxyState(self.identity, self.policy, plane, self.member, now().mono_s, _rule_names(config))
         self.on_reload: Callable[[], None] | None = None
