@@ -13,7 +13,7 @@ from typing import Final
 from gdp.client.participant import Participant
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
-from gdp.intervals import TICK_S
+from gdp.intervals import UPKEEP_S
 from gdp.links.uplink import load_plane, open_uplink
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
@@ -54,7 +54,7 @@ class SessionNode(Node):
             state.local_name = lambda name: labels.get(name, name.short)
             self.drive(state, self.runtime)
             self.begin(self.runtime)
-            self.runtime.every(TICK_S, EpochTimer(self.reload_for_epoch).handle_timer)
+            self.runtime.every(UPKEEP_S, EpochTimer(self.reload_for_epoch).handle_timer)
             self._opened = stack.pop_all()
 
     def waiting_for(self) -> str:
