@@ -178,7 +178,7 @@ class KeepaliveSessions:
         self._configure(session, mac)
         self._ends.put(end, _NUMBER.pack(slot))
         self._sessions[key] = session
-        self._plan(time.monotonic())
+        self._arrange()
         return KeepaliveRun(offer.port, offer.name, offer.nonce, received=offer.received, heard_s=offer.heard_s)
 
     def _configure(self, session: _Session, mac: bytes) -> None:
@@ -195,7 +195,7 @@ class KeepaliveSessions:
         run = self._report(session)._replace(is_over=True)
         del self._sessions[key]
         heappush(self._free, session.slot)
-        self._plan(time.monotonic())
+        self._arrange()
         return run
 
     def _report(self, session: _Session) -> KeepaliveRun:
@@ -223,7 +223,8 @@ class KeepaliveSessions:
         self._plan(now_s)
 
     def _send(self, sessions: list[_Session], now_s: float) -> None:
-        slots, jitter, words = [each.slot for each in sessions], os.urandom(1)[0] * JITTER, self._words
+        slots, words = [each.slot for each in sessions], self._words
+        jitter = JITTER * (int(now_s * 1e6) & 255)  # of the moment of a wake-up, as good as random for this
         if slots != self._listed:
             self._listed = slots
             self._slots.put_many([_NUMBER.pack(at) for at in range(len(slots))], [*map(_NUMBER.pack, slots)])
@@ -239,17 +240,21 @@ class KeepaliveSessions:
                 session.sent_s.append(now_s)
                 session.sent = sent
 
+    def _arrange(self) -> None:
+        """Set the shortest interval after sessions have come or gone, and plan."""
+        self._interval_s = min([each.offer.out_interval_s for each in self._sessions.values()], default=0.0)
+        self._plan(time.monotonic())
+
     def _plan(self, now_s: float) -> None:
         """Set when the next tick is due: silence is looked at when keepalives leave, half an interval late at most."""
         words, sessions = self._words, self._sessions.values()
         heard = [words[each.slot * _WORDS + _HEARD_AT] * 1e-9 + each.offer.suspect_s for each in sessions]
         silent_at_s = min(heard, default=NEVER_S)
         send_at_s = min([each.send_at_s for each in sessions], default=NEVER_S)
-        interval_s = min([each.offer.out_interval_s for each in sessions], default=NEVER_S)
         if silent_at_s <= now_s:
             self.has_news = True
-        self._send_at_s, self._interval_s = send_at_s, interval_s
-        self.due_s = min(send_at_s, silent_at_s + interval_s / 2)
+        self._send_at_s = send_at_s
+        self.due_s = min(send_at_s, silent_at_s + self._interval_s / 2)
 
     def poll(self, now_s: float, *, reports: bool = False) -> tuple[list[KeepaliveRun], float]:
         """Return what happened in sessions that end, and how late a tick was; with ``reports`` also in the others."""

@@ -17,7 +17,7 @@ from contextlib import ExitStack, closing
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
-from gdp.intervals import RETRY_S, SoftState
+from gdp.intervals import RETRY_S, UPKEEP_S, SoftState
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT, PortFlag
 from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment, has_links
 from gdp.ports.kernel.device import TxDrops, peer_is_bare
@@ -82,7 +82,7 @@ class KernelPlane(KeepalivePlane):
         """The present counts of the kernel and of this process together.
 
         A device does not report that it refused a redirected frame. Such a frame counts as forwarded, and as
-        ``PORT_FULL`` after the next query of the devices. ``poll`` makes it twice a second while frames are forwarded.
+        ``PORT_FULL`` after the next query of the devices. ``poll`` makes it each second while frames are forwarded.
         """
         here, there = self._counters, self._loaded.counters()
         drops = [a + b for a, b in zip(here.drops, there.drops, strict=True)]
@@ -195,7 +195,7 @@ class KernelPlane(KeepalivePlane):
         """Do what no notification triggers: renew the lease, check each port's egress, and read refusals."""
         self._loaded.renew(_FILTER.lease_s)
         now_s, forwarded = time.monotonic(), self._loaded.counters().forwarded
-        self._next_upkeep_s = now_s + _FILTER.refresh_s / 2
+        self._next_upkeep_s = now_s + (_FILTER.refresh_s / 2 if self._loaded.is_leased else UPKEEP_S)
         if forwarded == self._forwarded and now_s < self._next_look_s:
             return  # no device had to send
         self._forwarded, self._next_look_s = forwarded, now_s + RETRY_S
