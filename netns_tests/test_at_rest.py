@@ -73,6 +73,10 @@ def came(node: NodeConnection) -> int:
     return frames(node) - begun
 
 
+def wait_for_kernel(node: NodeConnection, role: str) -> None:
+    until(lambda: came(node) < KEEPALIVES / 4, f"keepalives of the {role} in the kernel", PATIENCE_S)
+
+
 def end_rib(nodes: BenchNodes) -> str:
     """End the RIB; return its configuration."""
     process = nodes.running.pop(("rib", "s1"))
@@ -86,7 +90,7 @@ def test_keepalives_wake_no_end_of_a_link_to_receive_them(nodes: BenchNodes) -> 
     for role, config in (("rib", file), ("proxy", recorder(nodes))):
         _, node = start(nodes, role, config)
         with closing(node):
-            until(lambda node=node: came(node) < KEEPALIVES / 4, f"keepalives of the {role} in the kernel", PATIENCE_S)
+            wait_for_kernel(node, role)
 
 
 def test_an_end_that_may_load_no_program_receives_them_itself(nodes: BenchNodes) -> None:
@@ -98,9 +102,9 @@ def test_an_end_that_may_load_no_program_receives_them_itself(nodes: BenchNodes)
 def test_a_frozen_end_is_lost_and_comes_back(nodes: BenchNodes) -> None:
     process, node = start(nodes, "rib", end_rib(nodes))
     with closing(node), closing(NodeConnection(find_control_socket(nodes.files / "nodes" / "switch-s1"))) as switch:
-        until(lambda: came(node) < KEEPALIVES / 4, "keepalives of the RIB in the kernel", PATIENCE_S)
+        wait_for_kernel(node, "rib")
         process.send(signal.SIGSTOP)
         until(lambda: switch.status()["neighbours"] == 0, "the loss of a frozen RIB", PATIENCE_S)
         process.send(signal.SIGCONT)
         until(lambda: switch.status()["neighbours"] == 1, "the return of the RIB", PATIENCE_S)
-        until(lambda: came(node) < KEEPALIVES / 4, "keepalives of the RIB in the kernel", PATIENCE_S)
+        wait_for_kernel(node, "rib")
