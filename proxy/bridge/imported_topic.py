@@ -22,6 +22,7 @@ from gdp.message.loss import Losses
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.control_services import GIVE, ControlServices
 from proxy.bridge.core.decoder import MessageDecoder, differences_of
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.exclusive_control import ExclusiveControl
@@ -99,6 +100,8 @@ class ImportedTopic:
         kind = MergedPublisher if dispatcher.endpoint.is_live else ChannelPublishers
         self._heard_s: dict[bytes, float] = {}  # when each publisher's last message came, the latest last
         self._output: LocalOutput = kind(dispatcher, self, flow_spec)
+        acts = () if self.control is None else (GIVE,)
+        self._services = ControlServices(context, dispatcher, flow_spec, lambda: [context.member.name], *acts)
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local readers."""
@@ -184,6 +187,7 @@ class ImportedTopic:
 
     def close(self, now_s: float) -> None:
         """Close the subscription and the local publisher."""
+        self._services.close()
         if self.control is not None:
             self.control.give(None, now_s)
             self.handle_timer(now_s)
