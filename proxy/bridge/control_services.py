@@ -96,11 +96,12 @@ class ControlServices:
         if not bodies:
             done({}, now_s)
         for reader, body in bodies.items():
-            common = {"name": self._flow_spec.name, "timeout_s": ANSWER_S, "reply_bytes": _REPLY_BYTES}
+            on_reply = partial(take, reader)
             try:
                 self._context.member.diagnostics.ask(
-                    reader, ASK, now=now, on_reply=partial(take, reader), body=body, **common
-                )
+                    reader, ASK, now=now, on_reply=on_reply, name=self._flow_spec.name, body=body, timeout_s=ANSWER_S,
+                    reply_bytes=_REPLY_BYTES,
+                )  # fmt: skip
             except LocalError as error:
                 log.warning("a reader is not asked for control reader=%s reason=%s", reader.short, error)
                 take(reader, None, 0.0)
