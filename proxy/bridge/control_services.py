@@ -16,6 +16,7 @@ from gdp.control.diagnostics import Reply
 from gdp.errors import LocalError
 from gdp.intervals import ANSWER_S
 from gdp.names import Name
+from gdp.printable import printable
 from gdp.sansio import Timestamps
 from proxy.bridge.cancellation import TRIGGER
 from proxy.bridge.context import BridgeContext
@@ -114,7 +115,7 @@ class ControlServices:
             self._respond(event, found, now_s)
             return
         asked = {"do": act, "at": time.time_ns()}
-        bodies = {reader: {**asked, "seen": reply.result["generation"]} for reader, reply in found.items()}
+        bodies = {reader: {**asked, "seen": reply.result.get("generation")} for reader, reply in found.items()}
         self._ask(bodies, now_s, partial(self._respond, event))
 
     def _respond(self, event: RequestReceived, replies: _Replies, now_s: float) -> None:
@@ -126,7 +127,7 @@ class ControlServices:
         own = bytes(self._context.member.name) if act == SHOW else None
         said = [_said(reader, reply, own) for reader, reply in replies.items()] or [(False, NO_READER)]
         endpoint, is_success = self._dispatcher.endpoint, all(each for each, _ in said)
-        text = "; ".join(text for _, text in said)
+        text = printable("; ".join(text for _, text in said))
         endpoint.answer(event.handle, event.ticket, trigger_response(text, endpoint.ros, is_success=is_success))
 
 
