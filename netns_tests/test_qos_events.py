@@ -1,4 +1,4 @@
-"""Events of QoS at far nodes of rclpy: a missed deadline crosses, and what cannot be promised is told on both sides."""
+"""Events of QoS at far nodes of rclpy: a missed deadline crosses, and what cannot be promised is reported."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def pair() -> Iterator[Pair]:
         yield made
 
 
-def test_a_missed_deadline_is_an_event_at_a_far_reader_and_what_cannot_cross_is_told(pair: Pair) -> None:
+def test_a_missed_deadline_is_an_event_at_a_far_reader_and_what_cannot_cross_is_reported(pair: Pair) -> None:
     talker, reader = pair.node("a", "talker"), pair.node("b", "reader")
     talker.tell("!" + _TALKER)
     reader.tell("!" + _READERS)

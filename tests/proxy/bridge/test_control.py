@@ -379,7 +379,7 @@ def test_who_lost_the_right_to_publish_takes_nothing_by_a_service(clocked: Drive
     assert (is_taken, clocked.holder) == (False, None)
 
 
-def test_a_topic_that_nobody_reads_under_control_and_a_silent_reader_are_told(clocked: Drive) -> None:
+def test_a_topic_without_a_reader_under_control_and_a_silent_reader_are_named(clocked: Drive) -> None:
     clocked.sites.reload(clocked.robot, imports=[DRIVE])
     clocked.sites.run(2)
     assert clocked.call(SERVER, "take") == (False, control_services.NO_READER)

@@ -27,7 +27,7 @@ HZ: Final = 10
 STAY_S: Final = (3.0, 15.0)  # at one switch
 LATE_S: Final = 20.0  # between two readers that come late
 LOSS_MAX: Final = 0.03
-CALM_S: Final = 10.0  # afterwards, in which nobody roams: the last transforms arrive
+CALM_S: Final = 10.0  # afterwards, in which none roams: the last transforms arrive
 ALL_STATIC: Final = Counter(f"{robot}/{pair.replace('>', f'>{robot}/')}" for robot in ROBOTS for pair in STATIC)
 
 Placed = tuple[str, float, float]
