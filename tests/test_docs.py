@@ -13,6 +13,7 @@ import pytest
 import typer
 import yaml
 
+import fleet_demo
 from fog.cli.app import app as fog
 from fog.launch.load import load as load_launch_file
 from fog.site import SiteConfig
@@ -51,6 +52,7 @@ APPS = {
     "scripts/fog_demo.sh": demo.app,
     "scripts/internet_demo.sh": internet_demo.app,
     "scripts/memory_demo.sh": memory_demo.app,
+    "scripts/fleet_demo.sh": fleet_demo.app,
 }
 SHELLS = ("bash", "sh")
 MODELS: dict[str, type[Section]] = {
