@@ -17,7 +17,7 @@ import resource
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Collection, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,7 +31,6 @@ __all__ = ["OVER_BUDGET", "SECONDS", "folder_of"]
 SECONDS: Final = Path(__file__).with_name("seconds.json")
 OVER_BUDGET: Final = 6  # exit status of pytest where all tests passed
 _REAL: Final = "GDP_REAL_PROGRAMS"
-_LIBRARIES: Final = "LD_LIBRARY_PATH"
 _SPLIT: Final = ("netns_tests/test_ring.py", "netns_tests/test_planes.py", "netns_tests/test_ring_live.py")
 _EXCESS: Final = 1.5  # times its budget that a folder may take
 _LEAST_S: Final = 20.0  # folders below this are too small to judge
@@ -62,8 +61,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Note when a test began."""
     item.stash[_BEGAN] = time.perf_counter(), _processor_s()
-    with _libraries_kept():
-        return (yield)
+    return (yield)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -84,26 +82,13 @@ def pytest_collection(session: pytest.Session) -> Generator[None, object, object
     """
     gc.disable()
     try:
-        with _libraries_kept():
-            for file in _share_of(session.config):
-                # what is raised here, the collection meets again
-                with contextlib.suppress(Exception, pytest.skip.Exception):
-                    importlib.import_module(".".join(file.relative_to(session.config.rootpath).with_suffix("").parts))
-            return (yield)
+        for file in _share_of(session.config):
+            with contextlib.suppress(Exception, pytest.skip.Exception):  # the collection meets it again, and says so
+                importlib.import_module(".".join(file.relative_to(session.config.rootpath).with_suffix("").parts))
+        return (yield)
     finally:
         gc.freeze()
         gc.enable()
-
-
-@contextlib.contextmanager
-def _libraries_kept() -> Iterator[None]:
-    """Undo what imports do to the path of libraries, as OpenCV's does: a program that has another is not forked."""
-    before = os.environ.get(_LIBRARIES)
-    try:
-        yield
-    finally:
-        os.environ.pop(_LIBRARIES, None)
-        os.environ.update({} if before is None else {_LIBRARIES: before})
 
 
 def _share_of(config: pytest.Config) -> list[Path]:

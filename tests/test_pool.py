@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import sys
-from pathlib import Path
-
 import pytest
 
-from lab import zygote
-from tests.pool import _is_over, _lesser, _libraries_kept, _next_unit, _pace, folder_of
+from tests.pool import _is_over, _lesser, _next_unit, _pace, folder_of
 
 BUDGETS = {"tests/attacks": 100.0, "tests/journeys": 200.0, "netns_tests": 300.0, "tests/vectors": 1.0}
 
@@ -50,22 +45,3 @@ def test_a_worker_waits_while_others_compute_and_computes_while_they_wait() -> N
     assert _next_unit(queue, known, [0.1, 0.2]) == "computes.py"
     assert _next_unit(queue, known, [0.1, 1.0]) == "waits.py::one"
     assert _next_unit(queue[1::2], known, [1.0, 1.0]) == "computes.py"
-
-
-def test_programs_of_this_run_are_forked() -> None:
-    """One that is executed costs a hundred times as much processor time."""
-    if zygote.Popen.zygote is None:
-        pytest.skip("this run executes programs: GDP_REAL_PROGRAMS or coverage")
-    program = zygote.Program.from_argv([sys.executable, "-m", "gdp.cli.switch"])
-    assert program is not None
-    assert zygote.Popen.zygote.can_run(program, os.environ, Path.cwd())
-
-
-def test_a_module_that_changes_the_path_of_libraries_changes_it_for_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    for before in ("/lib", None):
-        monkeypatch.setenv("LD_LIBRARY_PATH", "/lib")
-        if before is None:
-            monkeypatch.delenv("LD_LIBRARY_PATH")
-        with _libraries_kept():
-            os.environ["LD_LIBRARY_PATH"] = "/opencv:/lib"
-        assert os.environ.get("LD_LIBRARY_PATH") == before
