@@ -101,11 +101,11 @@ def test_a_link_that_is_taken_down_under_a_stream_costs_only_what_is_counted(lay
     row.poll(0)
     row.space.ip("link", "set", end, "down")
     row.send(*[frame()] * 40)  # before the switches receive the link event
-    row.until(lambda: not row.planes[1].port_state(1))
+    row.until(lambda: not row.planes[1].ports[1].up)
     row.send(*[frame()] * 40)
     row.settle()
     row.space.ip("link", "set", end, "up")
-    row.until(lambda: row.planes[1].port_state(1) and row.planes[2].port_state(0))
+    row.until(lambda: row.planes[1].ports[1].up and row.planes[2].ports[0].up)
     before = len(row.delivered)
     row.send(*[frame()] * 40)
     row.settle()
@@ -121,7 +121,7 @@ def test_what_had_arrived_from_a_device_that_is_deleted_goes_on_and_the_rest_is_
     for _ in range(50):
         row.poll(0, 1)  # now they wait at the third switch, unless the kernel has brought them to B
     row.space.ip("link", "del", "c0")
-    row.until(lambda: not row.planes[1].port_state(1) and not row.planes[2].port_state(0))
+    row.until(lambda: not row.planes[1].ports[1].up and not row.planes[2].ports[0].up)
     row.send(*[frame()] * 40)
     row.settle()
     assert row.sums() == (540, 540)
@@ -135,10 +135,10 @@ def test_a_device_that_is_deleted_and_made_again_under_a_stream_loses_nothing_un
         row.poll()
         row.discarded += discarded("c1")  # sent by the second switch before the third had opened the device
         row.space.ip("link", "del", "c0")
-        row.until(lambda: not row.planes[1].port_state(1) and not row.planes[2].port_state(0))
+        row.until(lambda: not row.planes[1].ports[1].up and not row.planes[2].ports[0].up)
         row.send(*[frame()] * 10)
         row.space.veth("c0", "c1", mac_of("c0"), mac_of("c1"))
-        row.until(lambda: row.planes[1].port_state(1) and row.planes[2].port_state(0))
+        row.until(lambda: row.planes[1].ports[1].up and row.planes[2].ports[0].up)
     row.discarded += discarded("c1")
     row.send(*[frame()] * 100)
     row.settle()

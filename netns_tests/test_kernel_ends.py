@@ -263,8 +263,8 @@ def test_a_device_that_another_switch_still_holds_is_opened_when_that_lets_go(sp
         end_s = time.monotonic() + 1.0
         while time.monotonic() < end_s:
             later.poll(0.1)
-        assert not later.port_state(index)
+        assert not later.ports[index].up
         former.close()
-        until(lambda: later.port_state(index), meanwhile=lambda: later.poll(1.0))
+        until(lambda: later.ports[index].up, meanwhile=lambda: later.poll(1.0))
     finally:
         later.close()

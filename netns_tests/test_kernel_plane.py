@@ -262,7 +262,7 @@ def test_a_deleted_port_is_down_for_the_kernel_too(
 ) -> None:
     plane = make_kernel(filled())
     space.ip("link", "del", "p1")
-    until(lambda: not plane.port_state(WIDE), meanwhile=lambda: plane.poll(LOOK_S))
+    until(lambda: not plane.ports[WIDE].up, meanwhile=lambda: plane.poll(LOOK_S))
     for each in (frame(ONE), frame(BOTH)):
         ends[IN].send(each)
     settle(plane, 2)

@@ -238,7 +238,7 @@ def test_a_stream_under_which_the_link_changes_loses_nothing(lab: Lab) -> None:
 def test_a_link_too_narrow_for_any_node_is_down_until_it_is_wider_again(lab: Lab) -> None:
     for ifname in ("a0", "a1"):
         lab.space.ip("link", "set", ifname, "mtu", str(MTU_MIN_BYTES - 1))
-    lab.until(lambda: not lab.planes[0].port_state(1))
+    lab.until(lambda: not lab.planes[0].ports[1].up)
     lab.resize(JUMBO, ("a0", "a1"), JUMBO)
     assert lab.crosses_in(os.urandom(MEGABYTE))[0] == JUMBO
 

@@ -309,7 +309,7 @@ def test_sending_to_a_removed_port_counts_as_down(node: Plane) -> None:
     node.remove_port(0)
     assert node.transmit(0, PEER_MACS[IN], [bytes(96), bytes(96)]) == 0
     assert node.counters.drops[DropReason.PORT_DOWN] == 2
-    assert not node.port_state(0)
+    assert 0 not in node.ports
 
 
 def test_a_removed_port_costs_its_copies_alone(switch: Plane, ends: dict[int, socket.socket]) -> None:
@@ -350,7 +350,7 @@ def test_a_cut_link_is_noticed_and_so_is_its_repair(
     heard = changes(switch)
     space.ip("link", "set", "q1", "down")
     poll_until(switch, lambda: heard == [(WIDE, False)])
-    assert not switch.port_state(WIDE)
+    assert not switch.ports[WIDE].up
     ends[IN].send(MARK)
     take_in(switch, 1)
     assert ends[NARROW].recv(1 << 16) == leaves(MARK, NARROW)[NARROW]
@@ -414,7 +414,7 @@ def test_a_port_added_while_it_runs_carries_frames(make: MakePlane, ends: dict[i
     table = Table()
     plane = make(["p0"], table)
     port = plane.add_port("p1")
-    assert plane.port_state(port)
+    assert plane.ports[port].up
     table.install(ONE, ((port, leaves(MARK, WIDE)[WIDE][:12]),), float("inf"))
     ends[IN].send(frame(ONE))
     take_in(plane, 1)
@@ -435,9 +435,9 @@ def test_a_device_that_may_come_later_is_opened_when_it_appears(node: Plane, spa
     heard: list[tuple[int, bool]] = []
     node.on_link(lambda port, up: heard.append((port, up)))
     port = node.add_port("p9", may_be_absent=True)
-    assert not node.port_state(port)
+    assert not node.ports[port].up
     space.veth("p9", "q9", bytes([2, 0, 0, 0, 0, 9]), PEER_MACS[IN])
-    poll_until(node, lambda: node.port_state(port))
+    poll_until(node, lambda: node.ports[port].up)
     assert heard == [(port, True)]
     assert node.ports[port].mac == bytes([2, 0, 0, 0, 0, 9])
     assert node.transmit(port, PEER_MACS[IN], [frame(ONE)[14:]]) == 1

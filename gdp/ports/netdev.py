@@ -208,10 +208,6 @@ class NetdevPlane(ABC):
             self._came.pop(index, None)
             self._devices = {ifindex: port for ifindex, port in self._devices.items() if port != index}
 
-    def port_state(self, index: int) -> bool:
-        """Return whether the port exists, is up and has a carrier."""
-        return index in self._mtus
-
     def frames_from(self, port: int) -> int:
         """Return how many frames have come from a port, as ``Plane.frames_from``."""
         return self._came[port]

@@ -140,9 +140,6 @@ class Plane(Protocol):
     def remove_port(self, index: int) -> None:
         """Close a port; hops that still name it count as ``PORT_DOWN``."""
 
-    def port_state(self, index: int) -> bool:
-        """Return whether the port exists, is up and has a carrier."""
-
     def frames_from(self, port: int) -> int:
         """Return how many frames have come from a port since its creation, forwarded and dropped ones too."""
 
