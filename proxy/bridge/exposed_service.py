@@ -301,7 +301,7 @@ class ExposedService(ServiceFlow):
     def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
         """Accept a request; one about a goal waits until the local server has accepted or rejected that goal."""
         if self._joint is not None:
-            self._joint.begin(now_s, patience_s, asked, raw)
+            self._joint.add(now_s, patience_s, asked, raw)
             return
         goal = goal_of(raw) if self.flow_spec.rule.kind == "action" else b""
         after = None if asked.part == GOAL else self._goals.accepting(goal)
@@ -319,7 +319,7 @@ class ExposedService(ServiceFlow):
 
     def _end_call(self, number: int, ending: str | bytes) -> None:
         """Send the response of a call that has ended, or the reason why there is none."""
-        ended = [self._serving.end(number), *(() if self._joint is None else self._joint.end(number))]
+        ended = [self._serving.end(number), *(() if self._joint is None else self._joint.end_partners(number))]
         for asked in ended:
             if asked is None:
                 continue

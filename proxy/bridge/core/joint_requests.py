@@ -29,7 +29,7 @@ class JointRequests:
         self._look_at = _LOOK_AT_LEAST  # so many groups, those are forgotten whose calls are over
         self._partners: dict[int, Sequence[int]] = {}  # of a released call: calls that get the same response
 
-    def begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
+    def add(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
         """Add a request; release it if no other one is missing. Raises ``LocalError`` as ``Serving`` does."""
         number = self._serving.begin(now_s, patience_s, asked, raw, is_held=True)
         if len(self._groups) >= self._look_at:  # each call costs constant time on average
@@ -41,7 +41,7 @@ class JointRequests:
             self._partners[number] = [other for _, other in group.values() if other != number]
             self._serving.release(number)
 
-    def end(self, number: int) -> list[Asked]:
+    def end_partners(self, number: int) -> list[Asked]:
         """End the partners of a call that has ended; return those whose clients wait."""
         ended = map(self._serving.end, self._partners.pop(number, ()))
         return [asked for asked in ended if asked is not None]
