@@ -118,13 +118,21 @@ class Serving(Generic[R]):
         return None if ended is None else ended.get(asked)
 
     def begin(
-        self, now_s: float, patience_s: float | None, asked: Asked, request: R, after: Asked | None = None
+        self,
+        now_s: float,
+        patience_s: float | None,
+        asked: Asked,
+        request: R,
+        after: Asked | None = None,
+        *,
+        is_held: bool = False,
     ) -> int:
         """Add a request; return its number.
 
         Args:
             patience_s: how long its client waits; None: no limit.
             after: a call to wait for, if that is under way.
+            is_held: it waits for ``release``.
 
         Raises:
             LocalError: this client's calls or waiting bytes have reached its share.
@@ -138,11 +146,16 @@ class Serving(Generic[R]):
         self._numbers[asked] = number
         self._shares[client] += 1
         self._waiting_bytes[client] += size
-        if after is None:
-            self._waiting.put(client, number)
-        else:
+        if after is not None:
             self._held_back.setdefault(after, {})[number] = None
+        elif not is_held:
+            self._waiting.put(client, number)
         return number
+
+    def release(self, number: int) -> None:
+        """Let a request that began held take its turn."""
+        if (served := self._calls.get(number)) is not None:
+            self._waiting.put(served.asked.client, number)
 
     def poll_turns(self, now_s: float) -> list[Turn[R]]:
         """Return, once, the requests whose turn it is."""

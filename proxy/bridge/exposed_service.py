@@ -31,6 +31,7 @@ from proxy.bridge.core.action_interface import CANCEL, GOAL, PROFILES, RESULT
 from proxy.bridge.core.bridge_election import presence_of, sign
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.goals import cancel_of, goal_of
+from proxy.bridge.core.joint_requests import JointRequests
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.ordered_server import OrderedServer
@@ -79,6 +80,8 @@ class ExposedService(ServiceFlow):
     ) -> None:
         super().__init__(context, dispatcher, flow_spec, topic)
         self._serving = _serving_of(flow_spec, dispatcher.endpoint.ros, random_start)
+        signers = flow_spec.rule.signers
+        self._joint = None if signers is None else JointRequests(signers, self._serving)
         self._goals = GoalCalls()
         self._cancels = 0  # number of the last cancel request of the proxy itself
         self._refuses_from_s: float | None = None
@@ -297,6 +300,9 @@ class ExposedService(ServiceFlow):
 
     def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
         """Accept a request; one about a goal waits until the local server has accepted or rejected that goal."""
+        if self._joint is not None:
+            self._joint.add(now_s, patience_s, asked, raw)
+            return
         goal = goal_of(raw) if self.flow_spec.rule.kind == "action" else b""
         after = None if asked.part == GOAL else self._goals.accepting(goal)
         self._serving.begin(now_s, patience_s, asked, raw, after)
@@ -313,14 +319,15 @@ class ExposedService(ServiceFlow):
 
     def _end_call(self, number: int, ending: str | bytes) -> None:
         """Send the response of a call that has ended, or the reason why there is none."""
-        asked = self._serving.end(number)
-        if asked is None:
-            return
-        self._goals.end(asked)
-        if isinstance(ending, bytes):
-            self._responses.respond(asked, ending)
-        else:
-            self._responses.fail(asked, Fault.REFUSED, ending)
+        ended = [self._serving.end(number), *(() if self._joint is None else self._joint.end_partners(number))]
+        for asked in ended:
+            if asked is None:
+                continue
+            self._goals.end(asked)
+            if isinstance(ending, bytes):
+                self._responses.respond(asked, ending)
+            else:
+                self._responses.fail(asked, Fault.REFUSED, ending)
 
     def _cancel_goal(self, goal: bytes, now_s: float) -> None:
         self._cancels += 1

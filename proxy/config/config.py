@@ -200,7 +200,7 @@ class ProxyConfig(Section):
             (
                 "import",
                 self.imports,
-                dict.fromkeys(("keep", "readiness", "stop", "at_once", "state_node", *REDUCTIONS), "expose"),
+                dict.fromkeys(("keep", "readiness", "stop", "at_once", "signers", "state_node", *REDUCTIONS), "expose"),
             ),
         ):
             for index, rule in enumerate(rules):
@@ -218,6 +218,8 @@ class ProxyConfig(Section):
                 if side == "expose" and rule.stop is not None and rule.at_once != 1:
                     ordered, needs = "with 'state: ordered' nothing is broken off", "this needs 'at_once: 1'"
                     yield (side, index, "stop"), ordered if rule.is_ordered else needs
+                if rule.is_ordered and rule.signers is not None:
+                    yield (side, index, "signers"), "with 'state: ordered' each request counts alone"
                 if rule.is_ordered and rule.at_once is not None:
                     yield (side, index, "at_once"), "with 'state: ordered' it is always 1"
 

@@ -64,6 +64,7 @@ _OWNER: Final = "owner"  # key of the validation context
 CALL_S: Final = 5.0
 COPIES_MAX: Final = 1_024
 AT_ONCE_MAX: Final = 65_536
+SIGNERS_MAX: Final = 16
 RATE_MAX_HZ: Final = 1e6
 VOXEL_MAX_M: Final = 1e3
 DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTPS 2.5, section 9.6.2
@@ -87,7 +88,7 @@ _OF_KINDS: Final = {  # keys that only the rules of these kinds have
         *REDUCTIONS,
     ),
     "services and actions": ("timeout_s", "on_timeout", "replication", "readiness", "sign"),
-    "services": ("stop", "at_once", "state", "state_node"),
+    "services": ("stop", "at_once", "signers", "state", "state_node"),
 }
 
 
@@ -330,6 +331,12 @@ class Rule(Section):
     )
     at_once: int | None = Field(
         default=None, ge=1, le=AT_ONCE_MAX, description="Exposed services: requests that the server has at a time."
+    )
+    signers: int | None = Field(
+        default=None,
+        ge=2,
+        le=SIGNERS_MAX,
+        description="Exposed services: so many machines send an equal request; the server gets it once.",
     )
     state: Literal["none", "ordered"] = Field(
         default="none", description="Services, both sides: every server gets all requests in one order."

@@ -226,6 +226,8 @@ def test_the_past_comes_from_a_store_to_importers_alone(place: Path, side: str, 
     [
         ("expose", "replication: {mode: some}", "replication: this stands in rules under import"),
         ("import", "at_once: 1", "at_once: this stands in rules under expose"),
+        ("import", "signers: 2", "signers: this stands in rules under expose"),
+        ("expose", "state: ordered, signers: 2", "signers: with 'state: ordered' each request counts alone"),
         ("import", "stop: /halt", "stop: this stands in rules under expose"),
         ("import", "state: ordered, state_node: /node", "state_node: this stands in rules under expose"),
         ("expose", "state_node: /node", "state_node: this needs 'state: ordered'"),
