@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
+import sys
 from collections.abc import Collection
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from lab.machine import GDP
 from lab.process import LabProcess, until
 from netns_tests.session_lab import PATIENCE_S, SessionLab, lines_of, session_lab
 from proxy.recordings.reader import BagReader
+from tests.gdp.stores.bucket_sites import NAME, environment
 from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns
@@ -94,6 +97,42 @@ def test_a_replayed_drive_is_exported_as_it_was_recorded(tmp_path: Path) -> None
         verified = lab.run("gdp", "store", "verify", segment.parent.name, "--store", str(store))
         assert verified.returncode == 1
         assert "altered" in verified.stdout
+
+
+def test_a_holder_with_an_empty_disk_has_what_its_bucket_has(tmp_path: Path) -> None:
+    pytest.importorskip("moto.server", reason="moto of the extra `dev` is not installed")
+    with session_lab(RIGHTS, TOPICS) as lab:
+        drive, incident = lab.folder / "drive.mcap", lab.folder / "incident.mcap"
+        lab.environment.update(environment("http://127.0.0.1:5000", lab.folder))
+        s3 = lab.launch([sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", "5000"], "s3", heard=False)
+        s3.until_logged("Running on")
+        lab.output(sys.executable, "-c", f"import boto3; boto3.client('s3').create_bucket(Bucket={NAME!r})")
+        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
+        words = ["--bucket", f"s3://{NAME}/robots", "--upload", "1", "--json"]
+
+        def serve(store: str) -> LabProcess:
+            holder = lab.launch(["gdp", "store", "serve", "holder", "--store", str(lab.folder / store), *words])
+            assert '"ready"' in lines_of(holder, 1)[0]
+            return holder
+
+        first = serve("first")
+        replay = ["gdp-replay", str(drive), "--config", str(robot(lab)), "--rate", "0", "--wait-readers", "0", "--json"]
+        done = lab.run(*replay)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert json.loads(done.stdout.splitlines()[-1])["unconfirmed"] == []
+        lab.kill(first)
+        shutil.rmtree(lab.folder / "first")
+        second = serve("second")
+        exported = lab.run("gdp", "store", "export", *TOPICS, "--node", "investigator", "-o", str(incident), "--json")
+        assert exported.returncode == 0, exported.stdout + exported.stderr
+        assert content(incident) == content(drive)
+        other = ["gdp", "store", "serve", "robot", "--store", str(lab.folder / "third"), *words]
+        refused = lab.run(*other)
+        assert refused.returncode
+        assert "uses it; give each holder a prefix of its own" in refused.stderr
+        for each in lab.output("gdp", "store", "ls", "--store", str(lab.folder / "second"), "--json").splitlines():
+            lab.output("gdp", "store", "verify", json.loads(each)["capsule"], "--store", str(lab.folder / "second"))
+        second.finish(signal.SIGTERM)
 
 
 def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path: Path) -> None:

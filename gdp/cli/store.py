@@ -35,13 +35,8 @@ from gdp.session.protocol.messages import Request
 from gdp.session.session import Session, open_node
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.stores.bucket import Bucket
-from gdp.stores.bucket_upkeep import (
-    BucketUpkeep,
-    note_place,
-    refuse_other_place,
-    remove_with_bucket,
-    stored_with_bucket,
-)
+from gdp.stores.bucket_folder import note_place, refuse_other_place, remove_with_bucket, stored_with_bucket
+from gdp.stores.bucket_upkeep import BucketUpkeep
 from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, StoreLimits, marks_of
 from gdp.stores.holder_exchange import run
 from gdp.stores.holder_upkeep import HolderUpkeep

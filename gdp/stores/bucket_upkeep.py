@@ -13,10 +13,9 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from functools import cache, partial
-from pathlib import Path
+from functools import partial
 from typing import Final
 
 from gdp.capsule.chain import Chain
@@ -28,14 +27,13 @@ from gdp.intervals import HOUR_S, MINUTE_S, STOP_S, UPKEEP_S
 from gdp.names import ZERO, Name
 from gdp.requests import Backoff
 from gdp.stores.bucket import Bucket, ChangedError, StoredObject
+from gdp.stores.bucket_folder import object_key
 from gdp.stores.capsule_ring import DESCRIPTOR
-from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, objects_of, remove, stored
-from gdp.stores.files import private, read_private, write_all
+from gdp.stores.capsule_store import CapsuleStore, StoredCapsule
 from gdp.stores.segments import SUFFIX
 
 log = logging.getLogger(__name__)
 
-_PLACE: Final = "bucket"  # a file in the holder's folder: the URL of what has its segments
 _CLAIM: Final = "holder"
 _READERS_MAX: Final = 2  # at once, so that others of the holder's workers stay free
 _PACE: Final = Backoff(UPKEEP_S, MINUTE_S)
@@ -95,7 +93,7 @@ class BucketUpkeep(ClosedOnExit):
                 self._check_claim()
                 is_checked = True
             for offset in dropped:
-                self._bucket.delete(_key(capsule.name, offset))
+                self._bucket.delete(object_key(capsule.name, offset))
                 self._set(capsule, offset, None)
             for offset in due:
                 if self._is_closing.is_set() or not self._upload(capsule, offset):
@@ -169,7 +167,7 @@ class BucketUpkeep(ClosedOnExit):
         if not objects:
             self._put(f"{name.to_text()}/{DESCRIPTOR}", capsule.descriptor.to_cbor(), None)
         before = objects.get(offset)
-        tag = self._put(_key(name, offset), data, None if before is None else before.tag)
+        tag = self._put(object_key(name, offset), data, None if before is None else before.tag)
         self._set(capsule, offset, StoredObject(size, tag))
         if offset == segments.last:
             self._lacking_s.pop(name, None)
@@ -197,7 +195,7 @@ class BucketUpkeep(ClosedOnExit):
             raise StoreError(f"{self._bucket.url}: it is slow, and others wait for it; try again")
         try:
             size, known = capsule.segments.size_of(offset), self._objects.get(capsule.name, {}).get(offset)
-            found = self._bucket.get(_key(capsule.name, offset))
+            found = self._bucket.get(object_key(capsule.name, offset))
             data, tag = found or (b"", "")
             if known is not None and tag != known.tag:
                 self._judge(capsule, offset, known, found)
@@ -244,7 +242,7 @@ class BucketUpkeep(ClosedOnExit):
                 objects[offset] = found
                 self._store.take_backed(capsule, offset, found.size)
             else:
-                self._judge(capsule, offset, given, self._bucket.get(_key(capsule.name, offset)))
+                self._judge(capsule, offset, given, self._bucket.get(object_key(capsule.name, offset)))
         if segments.end != before:
             self._store.resume(capsule)
         capsule.backed = max(capsule.backed or 0, _end_of(objects))
@@ -300,56 +298,6 @@ def proven_bytes(capsule: StoredCapsule, data: bytes) -> int:
             chain.handle_record(wire, may_skip=not end)
             end += len(wire)
     return end
-
-
-def refuse_other_place(folder: Path, url: str | None) -> None:
-    """Check that a holder's folder has its segments in this bucket. Raises ``LocalError``: another one has them."""
-    known = _place_of(folder)
-    if known not in (None, url):
-        raise LocalError(f"{folder}: its segments are in {known}; name that bucket")
-
-
-def note_place(folder: Path, url: str) -> None:
-    """Note which bucket has the segments of a holder's folder. Raises ``LocalError``: the system refuses."""
-    write_all(folder, {_PLACE: private(url.encode())}, force=True)
-
-
-def stored_with_bucket(folder: Path) -> Iterator[StoredCapsule]:
-    """Yield the capsules of a store, also what its bucket has of them; records are read from there."""
-    url = _place_of(folder)
-    opened = cache(Bucket)
-    for capsule in stored(folder):
-        if url is not None:
-            for offset, known in objects_of(folder, capsule.name).items():
-                if not capsule.segments.size_of(offset):
-                    capsule.segments.set_absent(offset, known.size)
-            capsule.segments.fetch = partial(_read_from, opened, url, capsule.name)
-        yield capsule
-
-
-def _read_from(opened: Callable[[str], Bucket], url: str, name: Name, offset: int) -> bytes:
-    found = opened(url).get(_key(name, offset))
-    if found is None:
-        raise StoreError(f"{url}: {_key(name, offset)}: there is no such object")
-    return found[0]
-
-
-def remove_with_bucket(folder: Path, name: Name) -> None:
-    """Remove a capsule from a store whose holder does not run, and from its bucket before. Raises ``GdpError``."""
-    url = _place_of(folder)
-    if url is not None:
-        with Bucket(url) as bucket:
-            for key, _ in list(bucket.list(f"{name.to_text()}/")):
-                bucket.delete(key)
-    remove(folder, name)
-
-
-def _place_of(folder: Path) -> str | None:
-    return read_private(folder / _PLACE).decode() if (folder / _PLACE).exists() else None
-
-
-def _key(name: Name, offset: int) -> str:
-    return f"{name.to_text()}/{offset:016x}{SUFFIX}"
 
 
 def _end_of(objects: Mapping[int, StoredObject]) -> int:

@@ -22,12 +22,7 @@ from gdp.errors import GdpError, LocalError, StoreError
 from gdp.intervals import HOUR_S
 from gdp.stores import bucket as bucket_module
 from gdp.stores.bucket import Bucket
-from gdp.stores.bucket_upkeep import (
-    note_place,
-    refuse_other_place,
-    remove_with_bucket,
-    stored_with_bucket,
-)
+from gdp.stores.bucket_folder import note_place, refuse_other_place, remove_with_bucket, stored_with_bucket
 from gdp.stores.holder_exchange import run
 from gdp.stores.holder_upkeep import HolderUpkeep
 from tests.draws import TIMES
