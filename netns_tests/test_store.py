@@ -135,6 +135,60 @@ def test_a_holder_with_an_empty_disk_has_what_its_bucket_has(tmp_path: Path) -> 
         second.finish(signal.SIGTERM)
 
 
+KEEPING = """
+import sys, time, gdp
+
+try:
+    with gdp.open("robot") as session:
+        session.publisher("/scan", keep=["store"])
+except gdp.LocalError as error:
+    print(error)
+with gdp.open("robot", state="state") as session:
+    with session.publisher("/scan", keep=["store"]) as publisher:
+        for number in range(int(sys.argv[1]), int(sys.argv[2])):
+            publisher.put(b"%d" % number)
+        end_s = time.monotonic() + float(sys.argv[3])
+        while not publisher.is_kept and time.monotonic() < end_s:
+            time.sleep(0.05)
+        print(publisher.is_kept, flush=True)
+"""
+READING = """
+import gdp
+from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
+from gdp.capsule.reading import CapsuleReader
+from gdp.session.protocol.wire import read_message
+from gdp.trust.right import Right
+
+with gdp.open("investigator") as session:
+    topic = session.core.resolve("/scan", Right.READ)
+
+    def ask(request):
+        return HolderAnswer.from_cbor(session.call("store", request.to_cbor(), replication=1).payload)
+
+    (about,) = ask(HolderRequest(ask=Ask.LIST, topic=topic.name)).descriptors
+    reader = CapsuleReader(about, topic.secrets)
+    while not reader.is_done:
+        for kept in reader.handle_response(ask(reader.next_request())):
+            print(read_message(kept.message)[1].decode())
+    print(reader.audit.findings)
+"""
+
+
+def test_a_program_keeps_what_it_publishes_and_the_next_one_uploads_what_the_first_could_not(tmp_path: Path) -> None:
+    with session_lab(RIGHTS, TOPICS) as lab:
+        (lab.folder / "state").mkdir()
+        missing, alone = lab.output(sys.executable, "-c", KEEPING, "0", "300", "0.5").splitlines()
+        assert "state of the session is missing" in missing
+        assert alone == "False"
+        store = lab.folder / "capsules"
+        holder = lab.launch(["gdp", "store", "serve", "holder", "--store", str(store), "--json"])
+        assert '"ready"' in lines_of(holder, 1)[0]
+        assert lab.output(sys.executable, "-c", KEEPING, "300", "400", "20").splitlines()[-1] == "True"
+        *read, findings = lab.output(sys.executable, "-c", READING).splitlines()
+        assert read == [str(each) for each in range(400)]
+        assert findings == "[]"
+
+
 def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path: Path) -> None:
     with session_lab(TWO, TOPICS) as lab:
         drive, (first, second) = lab.folder / "drive.mcap", (lab.folder / "a", lab.folder / "b")
