@@ -13,13 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+import pytest
+
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import Ask
-from gdp.stores import capsule_store
 from gdp.stores.bucket import Bucket
 from gdp.stores.capsule_store import CapsuleStore
 from gdp.stores.segments import Segments
-from tests.gdp.stores.bucket_sites import FILE_BYTES, LIMITS, BackedSite
+from tests.gdp.stores.bucket_sites import LIMITS, BackedSite, short_segments
 
 T = TypeVar("T")
 
@@ -59,7 +60,7 @@ def main(folder: Path, prefix: str, left: int, capsule_bytes: int) -> None:
     ):
         for name in names:
             setattr(owner, name, steps.around(getattr(owner, name)))
-    capsule_store.SEGMENT_BYTES = FILE_BYTES * capsule_store._BACKED_PARTS  # type: ignore[misc]
+    short_segments(pytest.MonkeyPatch())
     limits = replace(LIMITS, cache_bytes=12_000, capsule_bytes=capsule_bytes or None)
     site = BackedSite(folder / "store", prefix, limits, about=about)
     at = site.ask(Ask.HEAD).offset if site.store.capsules else 0
