@@ -13,7 +13,7 @@ from typing import Final
 from gdp.errors import LocalError, StoreError
 from gdp.names import Name
 from gdp.stores.bucket import Bucket
-from gdp.stores.capsule_store import StoredCapsule, objects_of, remove, stored
+from gdp.stores.capsule_store import StoredCapsule, index_of, objects_of, remove, stored
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.segments import SUFFIX
 
@@ -43,7 +43,9 @@ def stored_with_bucket(folder: Path) -> Iterator[StoredCapsule]:
     opened = cache(Bucket)
     for capsule in stored(folder):
         if url is not None:
-            for offset, known in objects_of(folder, capsule.name).items():
+            with index_of(folder) as index:
+                known_objects = objects_of(index, capsule.name)
+            for offset, known in known_objects.items():
                 if not capsule.segments.size_of(offset):
                     capsule.segments.set_absent(offset, known.size)
             capsule.segments.fetch = partial(_read_from, opened, url, capsule.name)

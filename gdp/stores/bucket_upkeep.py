@@ -29,7 +29,7 @@ from gdp.requests import Backoff
 from gdp.stores.bucket import Bucket, ChangedError, StoredObject
 from gdp.stores.bucket_folder import object_key
 from gdp.stores.capsule_ring import DESCRIPTOR
-from gdp.stores.capsule_store import CapsuleStore, StoredCapsule
+from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, objects_of
 from gdp.stores.segments import SUFFIX
 
 log = logging.getLogger(__name__)
@@ -223,7 +223,7 @@ class BucketUpkeep(ClosedOnExit):
                 descriptor = Descriptor.from_cbor(b"" if found_one is None else found_one[0])
                 if descriptor.name != name:
                     raise LocalError("its descriptor is another one's")
-                capsules[name] = self._store.restore(descriptor)
+                capsules[name] = self._store.adopt(descriptor, has_quota=False)
                 log.info("capsule restored name=%s objects=%d", name.short, len(listed[name]))
             except (RemoteError, LocalError) as error:
                 self._store.note(name, f"not restored from the bucket: {error}")
@@ -232,7 +232,7 @@ class BucketUpkeep(ClosedOnExit):
         self._evict()
 
     def _compare_capsule(self, capsule: StoredCapsule, listed: Mapping[int, StoredObject]) -> None:
-        segments, known = capsule.segments, self._store.objects(capsule)
+        segments, known = capsule.segments, objects_of(self._store.index, capsule.name)
         segments.fetch = partial(self._fetch, capsule)
         objects = self._objects.setdefault(capsule.name, {})
         before = segments.end
@@ -266,7 +266,10 @@ class BucketUpkeep(ClosedOnExit):
 
     def _set(self, capsule: StoredCapsule, offset: int, found: StoredObject | None) -> None:
         objects = self._objects.setdefault(capsule.name, {})
-        self._store.set_object(capsule, offset, found)
+        with self._store.index.writing() as index:
+            index.execute("DELETE FROM objects WHERE capsule = ? AND offset = ?", (capsule.name, offset))
+            if found is not None:
+                index.execute("INSERT INTO objects VALUES (?, ?, ?, ?)", (capsule.name, offset, *found))
         if found is None:
             objects.pop(offset, None)
         else:
@@ -287,7 +290,11 @@ class BucketUpkeep(ClosedOnExit):
         for _, capsule, offset in sorted(found, key=lambda each: each[0]):
             if excess <= 0:
                 return
-            excess -= self._store.evict(capsule, offset)
+            with self._store.lock:
+                size, is_last = capsule.segments.size_of(offset), offset == capsule.segments.last
+                if size and not is_last and offset not in capsule.segments.absent:
+                    capsule.segments.evict(offset)
+                    excess -= size
 
 
 def proven_bytes(capsule: StoredCapsule, data: bytes) -> int:

@@ -154,6 +154,7 @@ class CapsuleStore(ClosedOnExit):
 
     Attributes:
         heads: of each capsule, where its last checkpoint is, with first bytes of the chain's head there.
+        index: of all capsules. ``lock``: of the files, and of what is known about them.
         refusal: why no records are taken; empty: they are.
 
     Raises:
@@ -164,9 +165,9 @@ class CapsuleStore(ClosedOnExit):
         self.folder = folder
         self.limits = limits
         self._unix_s = unix_s
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self._index = TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL")
+        self.index = index_of(folder)
         self._capsules: dict[Name, StoredCapsule] = {}
         self.heads = SyncSet[int](int)
         self._faults: dict[Name, str] = {}
@@ -185,11 +186,13 @@ class CapsuleStore(ClosedOnExit):
         """
         request = HolderRequest.from_cbor(wire)
         if request.ask is Ask.READ:  # may wait for a bucket
-            found = self._capsules.get(request.capsule)
-            return (HolderAnswer() if found is None else self._read(found, request)).to_cbor()
-        with self._lock:
+            known = self._capsules.get(request.capsule)
+            return (HolderAnswer() if known is None else self._read(known, request)).to_cbor()
+        with self.lock:
             if request.ask is Ask.LIST:
-                return self._list(request.topic).to_cbor()
+                found = [each.descriptor for each in self._capsules.values()]
+                of_topic = [each for each in found if request.topic in (ZERO, each.topic.name)]
+                return HolderAnswer(descriptors=tuple(of_topic[:LISTED_MAX])).to_cbor()
             if request.ask is Ask.APPEND:
                 return self._append(request, client).to_cbor()
             if request.ask is Ask.SYNC:
@@ -198,35 +201,33 @@ class CapsuleStore(ClosedOnExit):
             if capsule is None:
                 return HolderAnswer().to_cbor()
             if request.ask is Ask.MARKS:
-                return HolderAnswer(data=b"".join(_marks(self._index, capsule.name))).to_cbor()
+                return HolderAnswer(data=b"".join(_marks(self.index, capsule.name))).to_cbor()
             return HolderAnswer(head=capsule.confirmed, offset=capsule.segments.end).to_cbor()
 
     def lines(self) -> tuple[bytes, bytes]:
         """Return the total of what is held, and lines of it, for a request to another holder."""
-        with self._lock:
+        with self.lock:
             return self.heads.total, self.heads.lines(b"")
 
-    def adopt(self, descriptor: Descriptor) -> StoredCapsule:
-        """Return a capsule that another holder has, a new one if it is not here.
+    def adopt(self, descriptor: Descriptor, *, has_quota: bool = True) -> StoredCapsule:
+        """Return a capsule that another holder or the bucket has, a new one if it is not here.
+
+        Args:
+            has_quota: it is not the bucket's, so it needs space for a batch.
 
         Raises:
             GdpError: its writer had no right when it began, a quota has no space for a batch, or the disk refuses.
         """
-        with self._lock:
+        with self.lock:
             known = self._capsules.get(descriptor.name)
-            capsule = known or self._create(descriptor, descriptor.begun_ms / 1e3)
-            self._refuse_above_quota(capsule.parties, capsule, BATCH_BYTES)
+            capsule = known or self._create(descriptor, descriptor.begun_ms / 1e3, has_quota=has_quota)
+            if has_quota:
+                self._refuse_above_quota(capsule.parties, capsule, BATCH_BYTES)
             return capsule
-
-    def restore(self, descriptor: Descriptor) -> StoredCapsule:
-        """Return a capsule whose segments are in the bucket. Raises ``GdpError``: as ``adopt``, but for quotas."""
-        with self._lock:
-            known = self._capsules.get(descriptor.name)
-            return known or self._create(descriptor, descriptor.begun_ms / 1e3, has_quota=False)
 
     def resume(self, capsule: StoredCapsule) -> None:
         """Continue behind the segments as they are now. Raises ``GdpError``: they cannot be read."""
-        with self._lock:
+        with self.lock:
             try:
                 self._resume(capsule)
             except RemoteError as error:
@@ -235,7 +236,7 @@ class CapsuleStore(ClosedOnExit):
     def take_backed(self, capsule: StoredCapsule, offset: int, size: int, data: bytes = b"") -> None:
         """Have the bucket's segment at an offset in place of what is here, unless more is here; index ``data``."""
         segments = capsule.segments
-        with self._lock:
+        with self.lock:
             is_here = offset in segments.offsets and offset not in segments.absent
             if size > segments.size_of(offset) or (size < segments.size_of(offset) and not is_here):
                 segments.set_absent(offset, size)
@@ -243,40 +244,22 @@ class CapsuleStore(ClosedOnExit):
 
     def fetch_again(self, capsule: StoredCapsule, offset: int) -> bool:
         """Replace a damaged segment by that of the bucket; return whether it has it. Raises ``GdpError``: not now."""
-        segments = capsule.segments
-        with self._lock:
-            known = self.objects(capsule).get(offset)
-            if known is None or known.size != segments.size_of(offset):
-                return False
+        segments, known = capsule.segments, objects_of(self.index, capsule.name).get(offset)
+        if segments.fetch is None or known is None or known.size != segments.size_of(offset):
+            return False
+        if offset != segments.last:
+            segments.fetch(offset)
+            return True
+        with self.lock:  # nothing is appended meanwhile
             segments.evict(offset)
             segments.read(offset, 1)
-            if capsule.damage and offset == segments.last:
+            if capsule.damage:
                 self._resume(capsule)
-            return True
-
-    def evict(self, capsule: StoredCapsule, offset: int) -> int:
-        """Remove a segment here that the bucket has; return its bytes. The last one stays."""
-        with self._lock:
-            size = capsule.segments.size_of(offset)
-            if offset in (*capsule.segments.absent, capsule.segments.last) or not size:
-                return 0
-            capsule.segments.evict(offset)
-            return size
-
-    def objects(self, capsule: StoredCapsule) -> dict[int, StoredObject]:
-        """Return what the bucket was given of a capsule, by offset."""
-        return _objects(self._index, capsule.name)
-
-    def set_object(self, capsule: StoredCapsule, offset: int, found: StoredObject | None) -> None:
-        """Note what the bucket has of the segment that begins at an offset; None: nothing."""
-        with self._index.writing() as index:
-            index.execute("DELETE FROM objects WHERE capsule = ? AND offset = ?", (capsule.name, offset))
-            if found is not None:
-                index.execute("INSERT INTO objects VALUES (?, ?, ?, ?)", (capsule.name, offset, *found))
+        return True
 
     def checkpoints(self, capsule: StoredCapsule) -> list[int]:
         """Return the offsets of its checkpoints, the last one first."""
-        with self._index.reading() as index:
+        with self.index.reading() as index:
             rows = index.execute(
                 "SELECT offset FROM checkpoints WHERE capsule = ? ORDER BY offset DESC", (capsule.name,)
             ).fetchall()
@@ -288,7 +271,7 @@ class CapsuleStore(ClosedOnExit):
         Raises:
             GdpError: as ``handle``.
         """
-        with self._lock:
+        with self.lock:
             before = capsule.segments.end
             self._add(capsule, offset, data)
         return capsule.segments.end != before
@@ -300,7 +283,7 @@ class CapsuleStore(ClosedOnExit):
             GdpError: the disk refuses, or what is behind them is still damaged.
         """
         segments = capsule.segments
-        with self._lock:
+        with self.lock:
             try:
                 old = segments.read(offset, segments.size_of(offset))[1]
             except StoreError:  # the file is gone
@@ -316,7 +299,7 @@ class CapsuleStore(ClosedOnExit):
 
     def retire(self, capsule: StoredCapsule) -> None:
         """Drop the oldest segments beyond the limits; the last one stays."""
-        with self._lock:
+        with self.lock:
             self._retire(capsule)
 
     def gaps(self, capsule: StoredCapsule) -> list[int]:
@@ -328,7 +311,7 @@ class CapsuleStore(ClosedOnExit):
     @property
     def capsules(self) -> list[StoredCapsule]:
         """Return the capsules here."""
-        with self._lock:
+        with self.lock:
             return list(self._capsules.values())
 
     def suspend(self, capsule: StoredCapsule, why: str) -> None:
@@ -354,16 +337,12 @@ class CapsuleStore(ClosedOnExit):
         """Close all files."""
         for capsule in self._capsules.values():
             capsule.segments.close()
-        self._index.close()
-
-    def _list(self, topic: Name) -> HolderAnswer:
-        found = [each.descriptor for each in self._capsules.values() if topic in (ZERO, each.descriptor.topic.name)]
-        return HolderAnswer(descriptors=tuple(found[:LISTED_MAX]))
+        self.index.close()
 
     def _read(self, capsule: StoredCapsule, request: HolderRequest) -> HolderAnswer:
         offset, segments = request.offset, capsule.segments
         if request.time_ns:
-            with self._index.reading() as index:
+            with self.index.reading() as index:
                 found = index.execute(
                     "SELECT offset FROM checkpoints WHERE capsule = ? AND time_ns <= ? AND offset >= ?"
                     " ORDER BY time_ns DESC, offset DESC LIMIT 1",
@@ -373,7 +352,7 @@ class CapsuleStore(ClosedOnExit):
         offset, data = segments.read(offset, BATCH_BYTES)
         described = b""
         if data and (request.time_ns or offset != request.offset):
-            with self._index.reading() as index:
+            with self.index.reading() as index:
                 row = index.execute(
                     "SELECT wire FROM descriptions WHERE capsule = ? AND number < ? ORDER BY number DESC LIMIT 1",
                     (capsule.name, number_of(data)),
@@ -491,7 +470,7 @@ class CapsuleStore(ClosedOnExit):
                 break
             segments.drop(segments.begin)
         if segments.begin != before:
-            with self._index.writing() as index:
+            with self.index.writing() as index:
                 index.execute(
                     "DELETE FROM checkpoints WHERE capsule = ? AND offset < ?", (capsule.name, segments.begin)
                 )
@@ -500,7 +479,7 @@ class CapsuleStore(ClosedOnExit):
         """Return whether all records before an offset, where a segment begins, are too old."""
         if self.limits.age_s is None:
             return False
-        with self._index.reading() as index:
+        with self.index.reading() as index:
             row = index.execute(
                 "SELECT time_ns FROM checkpoints WHERE capsule = ? AND offset = ?", (capsule.name, next_offset)
             ).fetchone()
@@ -509,7 +488,7 @@ class CapsuleStore(ClosedOnExit):
     def _resume(self, capsule: StoredCapsule) -> None:
         """Read the last segment, and those before it from the last one that is indexed on; index them."""
         segments = capsule.segments
-        with self._index.reading() as index:
+        with self.index.reading() as index:
             (last,) = index.execute("SELECT max(offset) FROM checkpoints WHERE capsule = ?", (capsule.name,)).fetchone()
         capsule.chain, found = replayed(capsule.descriptor, segments)
         capsule.damage, capsule.rest = "", b""
@@ -537,7 +516,7 @@ class CapsuleStore(ClosedOnExit):
         name, checkpoints = capsule.name, [(at, of) for at, of, _ in found if of.type is RecordType.CHECKPOINT]
         described = [(name, of.number, wire) for _, of, wire in found if of.type is RecordType.DESCRIPTION]
         marks = [(name, of.number, wire) for _, of, wire in found if of.type is RecordType.MARK]
-        with self._index.writing() as index:
+        with self.index.writing() as index:
             places = [(name, at, each.number, each.time_ns) for at, each in checkpoints]
             index.executemany("INSERT OR REPLACE INTO checkpoints VALUES (?, ?, ?, ?)", places)
             index.executemany("INSERT OR REPLACE INTO descriptions VALUES (?, ?, ?)", described)
@@ -548,7 +527,8 @@ class CapsuleStore(ClosedOnExit):
             self.heads.put(name, rank)
 
 
-def _objects(index: TransactionFile, name: Name) -> dict[int, StoredObject]:
+def objects_of(index: TransactionFile, name: Name) -> dict[int, StoredObject]:
+    """Return what the bucket was given of a capsule, by offset. Raises ``StoreError``: the index cannot be read."""
     with index.reading() as open_index:
         rows = open_index.execute("SELECT offset, size, tag FROM objects WHERE capsule = ? ORDER BY offset", (name,))
         return {offset: StoredObject(size, tag) for offset, size, tag in rows}
@@ -563,16 +543,15 @@ def _marks(index: TransactionFile, name: Name) -> list[bytes]:
     return [wire for wire, size in zip(found, sizes, strict=True) if size <= BATCH_BYTES][::-1]
 
 
+def index_of(folder: Path) -> TransactionFile:
+    """Return the index of a store. Raises ``StoreError``: it cannot be opened."""
+    return TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL")
+
+
 def marks_of(folder: Path, name: Name) -> list[Record]:
     """Return the latest marks of a capsule in a store. Raises ``StoreError``: the index cannot be read."""
-    with TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL") as index:
+    with index_of(folder) as index:
         return [Record.from_wire(wire) for wire in _marks(index, name)]
-
-
-def objects_of(folder: Path, name: Name) -> dict[int, StoredObject]:
-    """Return what a store gave to its bucket of a capsule, by offset. Raises ``StoreError``: as ``marks_of``."""
-    with TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL") as index:
-        return _objects(index, name)
 
 
 def _parties_of(descriptor: Descriptor) -> tuple[bytes, bytes]:
@@ -589,7 +568,7 @@ def remove(folder: Path, name: Name) -> None:
     place = folder / name.to_text()
     if not (place / DESCRIPTOR).exists():
         raise LocalError(f"{place}: no capsule")
-    with TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL") as file, file.writing() as index:
+    with index_of(folder) as file, file.writing() as index:
         for table in ("checkpoints", "descriptions", "marks", "objects"):
             index.execute(f"DELETE FROM {table} WHERE capsule = ?", (name,))
     shutil.rmtree(place)

@@ -70,12 +70,12 @@ class BackedSite:
         self.about = about
         self.unix_s: float = NOW_S
         self.now_s = 0.0
+        self.bucket = Bucket(self.url)
         self.open()
 
     def open(self, *, takes: bool = False) -> None:
         """Start."""
         self.store = CapsuleStore(self.folder, self.limits, lambda: self.unix_s)
-        self.bucket = Bucket(self.url)
         self.upkeep = BucketUpkeep(self.store, self.bucket)
         try:
             self.upkeep.open(self.holder, takes=takes)
@@ -86,7 +86,6 @@ class BackedSite:
     def close(self) -> None:
         """Stop."""
         self.upkeep.close()
-        self.bucket.close()
         self.store.close()
 
     def restart(self, *, takes: bool = False) -> None:

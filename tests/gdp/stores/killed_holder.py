@@ -18,7 +18,7 @@ import pytest
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import Ask
 from gdp.stores.bucket import Bucket
-from gdp.stores.capsule_store import CapsuleStore
+from gdp.stores.bucket_upkeep import BucketUpkeep
 from gdp.stores.segments import Segments
 from tests.gdp.stores.bucket_sites import LIMITS, BackedSite, short_segments
 
@@ -55,7 +55,7 @@ def main(folder: Path, prefix: str, left: int, capsule_bytes: int) -> None:
     steps = Steps(left)
     for owner, names in (
         (Bucket, ("put", "delete")),
-        (CapsuleStore, ("set_object",)),
+        (BucketUpkeep, ("_set",)),
         (Segments, ("evict", "drop", "append", "keep_fetched")),
     ):
         for name in names:

@@ -51,6 +51,7 @@ def site(tmp_path: Path) -> Iterator[BackedSite]:
     made = BackedSite(tmp_path / "store", uuid.uuid4().hex)
     yield made
     made.close()
+    made.bucket.close()
 
 
 def emptied(site: BackedSite) -> None:
@@ -342,7 +343,7 @@ def test_an_object_that_was_exchanged_is_named_when_it_is_read(site: BackedSite)
     offset = site.capsule.segments.offsets[2]
     found = site.bucket.get(site.key(offset))
     assert found is not None
-    site.store.evict(site.capsule, offset)
+    site.capsule.segments.evict(offset)
     site.overwrite(offset, found[0][:-20])
     given = site.ask(Ask.READ, offset).data
     assert found[0].startswith(given)
