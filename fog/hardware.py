@@ -12,6 +12,7 @@ from typing import Final
 from gdp.errors import LocalError
 
 GPUS: Final = ("T4", "L4", "A10G", "V100", "A100", "H100", "K80", "P100", "P4", "L40S")
+HOURS_A_MONTH: Final = 730.0  # 365 days of 24 hours, over 12
 _FORM: Final = "cpu:N, mem:GiB, a GPU such as T4, or gpu:T4:2; several with commas between"
 
 

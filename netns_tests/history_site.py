@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -114,7 +115,9 @@ def history_site(seconds: float) -> Iterator[Site]:
     """Run a lab with a recorded drive of these seconds, and a holder of nothing yet."""
     with session_lab(RIGHTS, TOPICS) as lab:
         drive, store = lab.folder / "drive.mcap", lab.folder / "capsules"
-        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", f"{seconds:g}", "-o", str(drive))
+        lab.output(
+            sys.executable, str(ROOT / "scripts/make_demo_bag.py"), "--seconds", f"{seconds:g}", "-o", str(drive)
+        )
         holder = lab.launch(["gdp", "store", "serve", "holder", "--store", str(store), "--json"])
         assert '"ready"' in lines_of(holder, 1)[0]
         (lab.folder / "state").mkdir()

@@ -1,4 +1,4 @@
-"""Benches of replicas and of recovery: a short round of each; the figures are not checked."""
+"""Bench of replicas: a short round of its parts; the figures are not checked."""
 
 from __future__ import annotations
 

@@ -13,7 +13,6 @@ pytestmark = [pytest.mark.netns, pytest.mark.nightly]
 
 _PATIENCE_S = 300.0
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
-needs_pillow = pytest.mark.skipif(find_spec("PIL") is None, reason="Pillow is not installed: gdp-ros[images]")
 needs_wireguard = pytest.mark.skipif(
     which("wireguard-go") is None or which("wg") is None, reason="wireguard-go or wireguard-tools is not installed"
 )
@@ -27,7 +26,6 @@ needs_wireguard = pytest.mark.skipif(
         pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[needs_ros2, needs_wireguard]),
         ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "gdp"],
         ["own_pace.py", "--quick", "--no-save"],
-        pytest.param(["reduce.py", "--quick"], marks=needs_pillow),
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         pytest.param(["ros.py", "--calls", "--quick", "--no-save"], marks=needs_ros2),
         pytest.param(["ros.py", "--trace", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),

@@ -20,7 +20,6 @@ _NEEDS = {
     "fig6": ("rclpy", "scipy", "matplotlib"),
     "fig7": ("rclpy", "scipy", "matplotlib"),
     "fig6 --compute": ("rclpy", "scipy", "matplotlib", "rapidocr_onnxruntime"),
-    "fig7 --compute": ("rclpy", "scipy", "matplotlib", "rapidocr_onnxruntime"),
     "fig9": ("rclpy", "cv2", "scipy", "matplotlib"),
     "outages": ("rclpy", "matplotlib"),
     "offload": ("rclpy", "cyclonedds", "cv2", "scipy", "matplotlib"),
@@ -54,7 +53,7 @@ def run(in_clone: InClone, tmp_path: Path) -> Callable[[str], dict[str, Any]]:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("name", ["fig4", "fig5", "fig6", "fig6 --compute", "fig7", "fig7 --compute", "fig9"])
+@pytest.mark.parametrize("name", ["fig4", "fig5", "fig6", "fig6 --compute", "fig7", "fig9"])
 def test_an_experiment_runs_to_its_page_without_a_failed_request(
     name: str, run: Callable[[str], dict[str, Any]]
 ) -> None:

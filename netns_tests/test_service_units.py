@@ -27,11 +27,7 @@ BOOT_S: Final = 60.0
 START_S: Final = 30.0
 WATCHDOG_S: Final = 4  # of the switch here; 30 in its unit
 NET_ADMIN, NET_RAW, PERFMON, BPF = 1 << 12, 1 << 13, 1 << 38, 1 << 39
-BOUNDS: Final = {
-    "switch": NET_ADMIN | NET_RAW | PERFMON | BPF,
-    "rib": NET_ADMIN | NET_RAW,
-    "proxy": NET_ADMIN | NET_RAW,
-}
+BOUND: Final = NET_ADMIN | NET_RAW | PERFMON | BPF
 FIRST: Final = """\
 import os, pathlib, sys
 status = pathlib.Path("/proc/self/status").read_text()
@@ -137,8 +133,8 @@ def test_each_node_runs_under_the_rights_of_its_unit_and_a_hung_one_is_restarted
         assert state["WatchdogUSec"] == (f"{WATCHDOG_S}s" if name == "switch" else "30s")
         text = machine.run("cat", f"{STATE}/gdp-{name}.rights")
         given = dict(line.split(":\t", 1) for line in text.splitlines() if ":\t" in line)
-        assert int(given["CapBnd"], 16) == BOUNDS[name]
-        assert int(given["CapEff"], 16) == BOUNDS[name]
+        assert int(given["CapBnd"], 16) == BOUND
+        assert int(given["CapEff"], 16) == BOUND
         assert (given["NoNewPrivs"], given["Seccomp"]) == ("1", "2")
         assert given["Uid"].split()[0] != "0"
     until(

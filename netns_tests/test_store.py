@@ -70,7 +70,7 @@ def robot(lab: SessionLab, topics: Collection[str] = tuple(TOPICS), to: object =
 def test_a_replayed_drive_is_exported_as_it_was_recorded(tmp_path: Path) -> None:
     with session_lab(RIGHTS, TOPICS) as lab:
         drive, store, incident = lab.folder / "drive.mcap", lab.folder / "capsules", lab.folder / "incident.mcap"
-        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
+        lab.output(sys.executable, str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
         holder = lab.launch(["gdp", "store", "serve", "holder", "--store", str(store), "--json"])
         assert '"ready"' in lines_of(holder, 1)[0]
         config = robot(lab)
@@ -192,7 +192,7 @@ def test_a_program_keeps_what_it_publishes_and_the_next_one_uploads_what_the_fir
 def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path: Path) -> None:
     with session_lab(TWO, TOPICS) as lab:
         drive, (first, second) = lab.folder / "drive.mcap", (lab.folder / "a", lab.folder / "b")
-        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
+        lab.output(sys.executable, str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
 
         def serve(node: str, own: str, other: str, store: Path) -> LabProcess:
             holder = lab.launch(
@@ -242,7 +242,7 @@ def test_gdp_up_runs_the_holder_of_a_machine(tmp_path: Path) -> None:
         store.mkdir()
         both = lab.run(*GDP, "store", "serve", "--config", str(machine), "--store", str(store))
         assert (both.returncode, "leave out NODE and the options" in both.stderr) == (2, True)
-        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
+        lab.output(sys.executable, str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
         up = lab.launch([*GDP, "up", str(lab.folder), "--no-systemd"], "up")
         up.until_logged(r"^store  \| holder .* serves store")
         done = lab.run(

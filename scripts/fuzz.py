@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _show(outcomes[-1])
         if options.keep:
             keep(outcomes[-1])
-    return _findings(outcomes, has_limits=options.limits)
+    return _findings(outcomes)
 
 
 def _engine(options: argparse.Namespace) -> tuple[Sequence[Decoder], _Fuzz]:
@@ -95,7 +95,6 @@ def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=2.0, help="for each decoder (default: 2)")
     parser.add_argument("--total", type=float, metavar="SECONDS", help="for all decoders together")
     parser.add_argument("--guided", action="store_true", help="guided by the branches that run (needs atheris)")
-    parser.add_argument("--limits", action="store_true", help="too much time or memory counts as a finding, too")
     parser.add_argument("--only", metavar="NAMES", default="", help="decoders, separated by commas")
     parser.add_argument("--seed", type=int, default=1, help="of the mutations (default: 1)")
     parser.add_argument("--list", action="store_true", help="list the decoders and exit")
@@ -123,11 +122,11 @@ def _show(outcome: Outcome) -> None:
     )
 
 
-def _findings(outcomes: Sequence[Outcome], *, has_limits: bool) -> int:
+def _findings(outcomes: Sequence[Outcome]) -> int:
     total = sum(outcome.executions for outcome in outcomes)
     foreign = sum(outcome.foreign for outcome in outcomes)
     excess = sum(finding.is_excess for outcome in outcomes for finding in outcome.findings.values())
-    found = sum(len(outcome.findings) for outcome in outcomes) - (0 if has_limits else excess)
+    found = sum(len(outcome.findings) for outcome in outcomes) - excess
     print(f"\n{total} executions of {len(outcomes)} decoders, {foreign} with a foreign exception, {excess} over limits")
     for outcome in outcomes:
         for place, finding in outcome.findings.items():

@@ -9,8 +9,22 @@
 set -euo pipefail
 
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+# table <sed script>: lines of pyproject.toml, without blanks and order
+table() {
+    sed -n "$1" pyproject.toml | sed 's/^ *//; /^$/d' | LC_ALL=C sort
+}
+
+digest=$({
+    table '/^requires-python = /p'
+    table '/^dependencies = \[$/,/^\]$/p'
+    table '/^\[project\.optional-dependencies\]$/,/^\[/{/^\[project\.o/p;/^\[/!p}'
+    cat requirements/build.in
+} | sha256sum)
+stamp="# pyproject dependencies: sha256:${digest%% *}"
 if [[ "${1-}" == --check ]]; then
-    exec python3 scripts/supply/lock_stamp.py --check
+    old=$(grep -LxF "$stamp" requirements/*.lock || true)
+    [[ -z "$old" ]] || { printf '%s: older than pyproject.toml (run scripts/lock.sh)\n' $old >&2; exit 1; }
+    exit
 fi
 uv=${UV:-uv}
 command -v "$uv" >/dev/null || { printf 'lock: uv is needed (pip install uv)\n' >&2; exit 2; }
@@ -28,4 +42,4 @@ compile dev.lock --all-extras --no-emit-package opencv-python "$@" pyproject.tom
 compile run.lock -c requirements/dev.lock --extra proxy --extra fog --extra scapy pyproject.toml
 compile ros2.lock -c requirements/dev.lock --extra proxy --extra fog --extra scapy --extra ros2 pyproject.toml
 compile build.lock -c requirements/dev.lock requirements/build.in
-python3 scripts/supply/lock_stamp.py --write
+sed -i -e "1i $stamp" -e '/^# pyproject dependencies: /d' requirements/*.lock

@@ -4,8 +4,6 @@
     scripts/readability.py                   print the figures
     scripts/readability.py --check           fail if a figure is worse than its limit, or a limit got looser
     scripts/readability.py --save            write the better of limit and figure as limits: they never get looser
-    scripts/readability.py --words           list each listed word as file:line:column: word
-    scripts/readability.py --names           list method names that many packages define
 
 ``scripts/readability.json`` holds the limits, the goals, the listed words and the exceptions, each with its reason.
 Exit status: 0 all limits hold, 1 a figure is worse, 2 wrong usage.
@@ -267,7 +265,6 @@ class Report(NamedTuple):
 
     figures: dict[str, float]
     words: list[Place]
-    names: list[tuple[int, str]]
     circles: list[list[str]]
 
 
@@ -299,7 +296,7 @@ def measure(root: Path, settings: Settings) -> Report:
         "words of docs": sum(len(page.read_text().split()) for page in _pages(root) if not _is_measured(page)),
         "tests": _test_count(files, root),
     }
-    return Report(figures, words, names, circles)
+    return Report(figures, words, circles)
 
 
 def is_worse(figure: str, value: float, limit: float) -> bool:
@@ -381,8 +378,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--check", action="store_true", help="fail if a figure is worse than its limit")
     parser.add_argument("--save", action="store_true", help="lower the limits to the present figures")
-    parser.add_argument("--words", action="store_true", help="list each place of a listed word")
-    parser.add_argument("--names", action="store_true", help="list method names that several packages define")
     options = parser.parse_args(argv)
     console = Console(highlight=False, soft_wrap=True)
     try:
@@ -390,15 +385,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         parser.error(str(error))
     report = measure(ROOT, settings)
-    if not options.words and not options.names:
-        console.print(_table(report, settings))
-        for circle in report.circles:
-            console.print("import circle:", ", ".join(circle), markup=False)
-    for place in report.words if options.words else ():
+    console.print(_table(report, settings))
+    for circle in report.circles:
+        console.print("import circle:", ", ".join(circle), markup=False)
+    for place in report.words:
         console.print(str(place), markup=False)
-    if options.names:
-        for count, name in report.names[:40]:
-            console.print(f"{count:3} {name}", markup=False)
     if options.save:
         save_limits(SETTINGS, report.figures)
     elif options.check:

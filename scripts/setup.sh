@@ -81,7 +81,7 @@ link_scripts() {
 
 # compile_own: builds the burst core where possible, and byte-compiles our packages: root leaves no caches of its own
 compile_own() {
-    "$venv/bin/python" -m compileall -q gdp proxy fog gdp_extensions scripts/ring scripts/fog_demo scripts/lab scripts/internet_demo scripts/memory_demo examples/grasp/grasp || fail "the source does not compile"
+    "$venv/bin/python" -m compileall -q gdp proxy fog gdp_extensions scripts/ring scripts/fog_demo scripts/lab scripts/internet_demo scripts/memory_demo scripts/fleet_demo.py examples/grasp/grasp || fail "the source does not compile"
     make --silent -C gdp/burst "PYTHON=$venv/bin/python" 2>/dev/null || true
     if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" ]]; then
         find gdp proxy fog gdp_extensions scripts examples \( -name __pycache__ -o -name core.abi3.so \) -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +

@@ -13,6 +13,7 @@ import pytest
 import typer
 import yaml
 
+import fleet_demo
 from fog.cli.app import app as fog
 from fog.launch.load import load as load_launch_file
 from fog.site import SiteConfig
@@ -24,7 +25,7 @@ from gdp.config.schema import Section
 from gdp.crypto.keys import SigningKey
 from gdp.errors import ConfigError
 from internet_demo import cli as internet_demo
-from memory_demo import cli as memory_demo
+from memory_demo import __main__ as memory_demo
 from proxy.cli import delegate, proxy, replay
 from proxy.config.config import ProxyConfig
 from ring import cli as ring
@@ -51,6 +52,7 @@ APPS = {
     "scripts/fog_demo.sh": demo.app,
     "scripts/internet_demo.sh": internet_demo.app,
     "scripts/memory_demo.sh": memory_demo.app,
+    "scripts/fleet_demo.sh": fleet_demo.app,
 }
 SHELLS = ("bash", "sh")
 MODELS: dict[str, type[Section]] = {

@@ -1,6 +1,6 @@
 """Measurements of spot machines, as shipped.
 
-I/O; reads one file of this package, which ``scripts/make_catalog.py`` computed.
+I/O; reads one file of this package, which ``git show 55cf6b3c:scripts/make_catalog.py`` computed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Price lists that this package ships, and the lookup in them.
 
-I/O; reads files of this package only. ``scripts/make_catalog.py`` generates the list of AWS EC2 for Linux: on-demand
-list prices, and spot machines at their published savings. The file states its sources and their date. A price that is
-not known for certain is absent, not estimated.
+I/O; reads files of this package only. ``git show 55cf6b3c:scripts/make_catalog.py`` generated the list of AWS EC2 for
+Linux: on-demand list prices, and spot machines at their published savings. The file states its sources and their date.
+A price that is not known for certain is absent, not estimated.
 The list of the provider ``local`` is simulated, to test choice, cost and budget free of charge. Prices per hour: 1 cent
 for a virtual CPU, 10 cents for a GPU, 60 % less for spot machines. They rise slightly from region to region, so one
 region is the cheapest.

@@ -18,11 +18,10 @@ from rich.text import Text
 
 from fog.cli.views import latency_lines, ms_text
 from fog.cluster import CloudNode
-from fog.hardware import Offer
+from fog.hardware import HOURS_A_MONTH, Offer
 from fog.latency.known import Latency
 from fog.launch.interface_discovery import kept, offered
 from fog.launch.load import Loaded, key_values, load
-from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.plan.target import Target
 from fog.topology import Gateway

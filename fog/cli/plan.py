@@ -13,10 +13,9 @@ from fog.catalog.measured import measured
 from fog.catalog.prices import aws_prices, price_list, regions_of
 from fog.cli.options import SiteFile, State
 from fog.cli.views import latency_lines, ms_text
-from fog.hardware import Hardware, Offer
+from fog.hardware import HOURS_A_MONTH, Hardware, Offer
 from fog.plan.answer import Answer, Question, answer
 from fog.plan.choice import BY_BOTH, Weights
-from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text, seconds_from_text
 from fog.site import peek_site
 from gdp.cli.console import Columns, console, folding

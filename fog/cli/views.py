@@ -15,8 +15,8 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from fog.hardware import HOURS_A_MONTH
 from fog.latency.known import NO_ENDPOINT, Latency
-from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.supervisor.core.record import Record, cost_usd, stage
 from fog.supervisor.journal import Cluster, Entry

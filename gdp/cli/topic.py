@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 import typer
 
@@ -17,11 +17,12 @@ from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
 from gdp.cli.options import Host, known_name
 from gdp.cli.output import show
 from gdp.cli.tables import bits, columns, short_count
-from gdp.management.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
-from gdp.management.topic_rates import RatedRow, known_names, rated_rows
 from gdp.names import Name
-from gdp.state.topic_rows import Direction, held_row
 from gdp.terminal import echo
+
+if TYPE_CHECKING:  # a help text asks no node
+    from gdp.management.running_nodes import Found, NodeTopics
+    from gdp.management.topic_rates import RatedRow
 
 _NOT_RUNNING: Final = 3
 _UNKNOWN: Final = 1
@@ -56,6 +57,9 @@ Node = Annotated[
 
 def complete_known(incomplete: str) -> list[str]:
     """Return the names that the running nodes of this machine carry."""
+    from gdp.management.running_nodes import find_running_nodes, read_topics
+    from gdp.management.topic_rates import known_names
+
     rows = known_names(read_topics(find_running_nodes())).values()
     return sorted({row.topic for row in rows if row.topic.startswith(incomplete)})
 
@@ -81,6 +85,8 @@ def list_topics(
       gdp topic list
       gdp topic list --all --json
     """
+    from gdp.state.topic_rows import Direction
+
     rows = _measured(seconds, socket, node, is_host=host)
     shown = [row for row in rows if all_ or row.row.direction is not Direction.HELD]
     if as_json:
@@ -126,6 +132,8 @@ for _word in _Topics.extensions:
 
 def answers_of(sockets: Sequence[Path], *, is_host: bool, is_needed: bool = True) -> tuple[Found, list[NodeTopics]]:
     """Return the running nodes and what they carry; exit 3 where none runs, and warn of those that do not answer."""
+    from gdp.management.running_nodes import find_running_nodes, read_topics
+
     found = find_running_nodes(sockets, is_host=is_host)
     answers = read_topics(found)
     for problem in found.problems:
@@ -147,6 +155,9 @@ def none_runs() -> typer.Exit:
 
 
 def _measured(seconds: float, sockets: Sequence[Path], node: Path | None, *, is_host: bool) -> list[RatedRow]:
+    from gdp.management.running_nodes import read_topics
+    from gdp.management.topic_rates import rated_rows
+
     held = [] if node is None else [_held_by(node)]
     found, before = answers_of(sockets, is_host=is_host, is_needed=not held)
     time.sleep(seconds if before else 0)  # the time over which the rates are measured
@@ -163,9 +174,11 @@ def _held_by(node: Path) -> NodeTopics:
         LocalError: the node does not exist, or its files are wrong.
     """
     from gdp.crypto.certificates import Role
+    from gdp.management.running_nodes import NodeTopics, RunningNode
     from gdp.nodes.delegation_store import DelegationStore
     from gdp.nodes.membership import load_member
     from gdp.session.settings import settings_of
+    from gdp.state.topic_rows import held_row
 
     settings = settings_of(node)
     identity, _ = load_member(settings.identity, settings.domain, Role.PROXY)

@@ -98,7 +98,9 @@ class LivenessMonitor:
 
     def note_alive(self, neighbour: Neighbour, heard_s: float) -> None:
         """Note when a valid frame of a neighbour came."""
-        neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None
+        neighbour.heard_s, neighbour.lateness_s = heard_s, self._lateness_s
+        if neighbour.let_go_s != -NEVER_S:  # what a revoked one has sent before does not keep it
+            neighbour.let_go_s = None
 
     def multiplier(self, timing: Timing, now_s: float) -> int:
         """Return how many keepalives of ours may be missing, as slow as this node is at present."""

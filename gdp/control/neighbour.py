@@ -84,7 +84,7 @@ class Neighbour:
     lateness_s: float = 0.0  # of this node, in all, when the neighbour was last heard
     incarnation_id: bytes = bytes(INCARNATION_BYTES)
     proof: tuple[bytes, bytes] | None = None  # of a RIB that is attached here: its membership, its RtCert for us
-    # it is removed then, unless a frame of it comes before: an older node has its identity
+    # it is removed then: an older node has its identity, unless a frame comes before; or its membership was revoked
     let_go_s: float | None = None
     refuses_us: bool = False  # its last hello reported that an older node has our identity
     is_proven: bool = False  # its present session has echoed our nonce: it is on this link now

@@ -312,7 +312,7 @@ class HelloProtocol:
                     self._policy.check_member(member, now.unix_s)
                 except StatementError:
                     self._next_s = None
-                    neighbour.heard_s = float("-inf")
+                    neighbour.let_go_s = -NEVER_S
 
     def schedule_removal(self, neighbour: Neighbour, now_s: float) -> None:
         """Have ``drop_silent`` remove a neighbour, because an older node with its identity is alive."""

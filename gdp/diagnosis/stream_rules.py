@@ -92,7 +92,7 @@ def qos_impossible(view: View) -> Iterator[Found]:
     """A local reader requests a QoS that no network can promise."""
     for end in view.importers:
         if end.flow.odd_qos:
-            text = f"A reader {end.place} matches nothing: {end.flow.odd_qos[0]}, which no network can promise."
+            text = f"A reader {end.place} matches nothing: {end.flow.odd_qos[0]}."
             yield text, f"ros2 topic info -v {end.flow.local}"
 
 

@@ -24,7 +24,7 @@ from gdp.extras import find_entry_point, install_command
 from gdp.intervals import SERVER_S
 
 FOG_FILE: Final = "fog.yaml"
-_NET: Final = ("CAP_NET_RAW", "CAP_NET_ADMIN")
+_NET: Final = ("CAP_NET_RAW", "CAP_NET_ADMIN", "CAP_BPF", "CAP_PERFMON")  # a device, and programs in the kernel
 _AWAIT_S: Final = "60"
 _ROS_VARIABLES: Final = (
     "PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "ROS_DISTRO", "ROS_DOMAIN_ID", "RMW_IMPLEMENTATION",
@@ -72,7 +72,7 @@ def programs_of(files: MemberFiles) -> list[MachineProgram]:
             name="switch",
             title=_TITLES["switch"],
             argv=_module("gdp.cli.switch", "--config", directory / "switch.yaml"),
-            capabilities=(*_NET, "CAP_BPF", "CAP_PERFMON"),
+            capabilities=_NET,
         )
     ]
     if (directory / RELAY_FILE).exists():

@@ -5,32 +5,37 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import TypeAlias
 
 from gdp.config.config import UplinkPlane
 from gdp.errors import LocalError
 from gdp.extras import require_extra
 from gdp.host.single_instance import own_devices
 from gdp.ports.netdev import NetdevPlane, NoDeviceError
-from gdp.ports.raw import RawPlane
 from gdp.ports.readiness import readable
 from gdp.ports.rtnetlink import LinkMonitor
 
 log = logging.getLogger(__name__)
 
+MakePlane: TypeAlias = Callable[[Sequence[str]], NetdevPlane]  # opens devices
+
 
 @contextlib.contextmanager
-def open_uplink(ifname: str, data_plane: UplinkPlane = "raw") -> Iterator[NetdevPlane]:
+def open_uplink(ifname: str, make: MakePlane) -> Iterator[NetdevPlane]:
     """Open a node's device; close it on leaving.
 
+    Args:
+        make: as from ``load_plane``.
+
     Raises:
-        MissingExtraError: Scapy is requested and not installed.
         LocalError: the device does not exist, another node uses it, or the process may not open raw sockets.
     """
     refuse_loopback([ifname])
     with own_devices([ifname]):
         try:
-            plane = load_plane(data_plane)([ifname])
+            plane = make([ifname])
         except NoDeviceError as error:
             raise LocalError(
                 f"{ifname}: no such device; start gdp-switch with attach: [{ifname}] first, or wait for it with"
@@ -42,14 +47,23 @@ def open_uplink(ifname: str, data_plane: UplinkPlane = "raw") -> Iterator[Netdev
             plane.close()
 
 
-def load_plane(data_plane: UplinkPlane) -> type[RawPlane] | type[NetdevPlane]:
-    """Return the class of a data plane. A confined process calls this before, because Scapy reads files when loaded.
+def load_plane(data_plane: UplinkPlane, stack: contextlib.ExitStack) -> MakePlane:
+    """Return what opens a data plane. A confined process calls this before: it reads files and loads programs.
+
+    Args:
+        stack: closes what the plane would have closed, if none is opened.
 
     Raises:
         MissingExtraError: Scapy is requested and not installed.
     """
     if data_plane == "raw":
-        return RawPlane
+        from gdp.ports.kernel.keepalive_plane import KeepalivePlane
+        from gdp.ports.kernel.keepalives import open_sessions
+
+        sessions = open_sessions()
+        if sessions is not None:
+            stack.callback(sessions.close)
+        return partial(KeepalivePlane, sessions=sessions)
     require_extra("scapy", ("scapy",), "data plane scapy")
     from gdp.ports.scapy_plane import ScapyPlane
 

@@ -1,7 +1,7 @@
 """Credentials of a running node: reload of its membership and trusted roots when their files change.
 
 I/O; it polls files. The issuer replaces ``node.crt``, ``root.crt`` or a root of ``domain.trusts``. The node reloads
-them within ``TICK_S``, or at once on SIGHUP, and keeps its name and session. The node logs
+them within ``UPKEEP_S``, or at once on SIGHUP, and keeps its name and session. The node logs
 credentials that are not valid, and keeps the present ones.
 """
 

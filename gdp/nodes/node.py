@@ -28,7 +28,7 @@ from gdp.control.hello import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
-from gdp.intervals import PACE_S, TICK_S
+from gdp.intervals import PACE_S, TICK_S, UPKEEP_S
 from gdp.links.relay_loop import RelayLoop
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers, ControlServer
@@ -137,13 +137,13 @@ class Node:
         self.node_log = NodeLog(state, on_wait)
         state.read_devices = self._counters.read
         for follow in (self.node_log.log_changes, state.refresh):
-            loop.every(TICK_S, follow)
+            loop.every(UPKEEP_S, follow)
         log_decisions(loop.every, state)
         self.follow_credentials(loop)
 
     def follow_credentials(self, loop: Loop) -> None:
         """Read certificates and roots again from within the loop, when they change."""
-        loop.every(TICK_S, self._credentials.reload_changed)
+        loop.every(UPKEEP_S, self._credentials.reload_changed)
 
     def reload(self) -> None:
         """Read certificates and roots again, where they changed."""

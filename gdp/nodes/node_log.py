@@ -1,6 +1,6 @@
 """Log of a node about its neighbours and about what it waits for, with device names.
 
-I/O; it polls the control plane twice a second and logs what changed.
+I/O; it looks at the control plane once a second and logs what changed.
 """
 
 from __future__ import annotations

@@ -59,8 +59,8 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
     with contextlib.ExitStack() as stack:
         audit = audit_folder(config.audit)
         node = Node("RIB", member, config, stack, state_folder=config.state, audit=audit)
+        make_plane = load_plane(config.data_plane, stack)
         if config.sandbox:
-            load_plane(config.data_plane)
             confine_rib(config)  # before the thread of the store starts; the device can still be opened
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)
@@ -74,7 +74,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             unrepeatable="" if config.store == "memory" else "what its cluster answered is not in its journal",
         )
         upkeep.start(host.rib, now())
-        plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
+        plane = stack.enter_context(open_uplink(config.iface, make_plane))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work, upkeep.has_work)
         state = RibState(identity, policy, plane, host, now().mono_s)

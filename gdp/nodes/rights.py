@@ -2,9 +2,9 @@
 
 I/O. A switch continues to open ports that come back and to remove its veth pairs (CAP_NET_RAW, CAP_NET_ADMIN). With the
 kernel data plane it also loads and attaches its program there (CAP_BPF, CAP_PERFMON). A RIB or proxy opens its device
-again when it comes back. A node reads the operator's folders again on SIGHUP, or when its certificates are replaced. If
-another user owns these, as in a shell of sudo, the node keeps the capability to read or write past the owner, and
-Landlock bounds it. A relay makes TAP devices while it runs (CAP_NET_ADMIN).
+again when it comes back, and its programs for keepalives are open. A node reads the operator's folders again on SIGHUP,
+or when its certificates are replaced. If another user owns these, as in a shell of sudo, the node keeps the capability
+to read or write past the owner, and Landlock bounds it. A relay makes TAP devices while it runs (CAP_NET_ADMIN).
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ def confine_rib(config: RibConfig) -> None:
     """Drop the rights that a RIB does not need; one with a store in a cluster opens connections."""
     store = None if config.store == "memory" else config.store.cluster
     needs = (
-        Needs(capabilities=_DEVICE)
+        Needs(capabilities=_DEVICE, uses_open_programs=True)
         if store
-        else Needs(capabilities=_DEVICE, reads=(), tcp_ports=_ports(config.metrics))
+        else Needs(capabilities=_DEVICE, uses_open_programs=True, reads=(), tcp_ports=_ports(config.metrics))
     )
     secrets = () if store is None else (store.password_file, store.ca, store.cert, store.key)
     sockets = map(_folder_of, (config.snapshot, config.control_socket))
@@ -95,6 +95,7 @@ def confine_proxy(
         capabilities=_DEVICE | ({Capability.DAC_OVERRIDE} if has_ros else frozenset()),
         writes=(Path(tempfile.gettempdir()), *(_ros_folders() if has_ros else ())),
         starts_programs=has_ros,
+        uses_open_programs=True,
     )
     _confine(config, needs, reads, writes)
 

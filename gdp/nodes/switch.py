@@ -15,7 +15,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.single_instance import own_devices
-from gdp.intervals import PACE_S, TICK_S
+from gdp.intervals import PACE_S, UPKEEP_S
 from gdp.links.uplink import refuse_loopback
 from gdp.links.veth import attach_pairs, switch_end
 from gdp.management.control_socket import ControlHandlers
@@ -104,7 +104,7 @@ def run_switch(
         dynamic = [each for each in (links, relay) if each is not None]  # it waits for no neighbour there
         state.unwaited = lambda: attachments.union(_absent(plane, optional), *(each.ports for each in dynamic))
         node.drive(state, runtime, on_wait)
-        runtime.every(TICK_S, lambda _: _end_if_displaced(switch))
+        runtime.every(UPKEEP_S, lambda _: _end_if_displaced(switch))
 
         def reload() -> None:
             node.reload()
@@ -241,7 +241,7 @@ def switch_sources(state: SwitchState, chosen: Chosen, loop: Loop) -> Sources:
     """Return the sources of metrics that a switch adds."""
     switch, plane = state.switch, state.plane
     two_paths = switch.multicast.path_counts()  # read in the node's own thread
-    loop.every(TICK_S, lambda _now: two_paths.update(switch.multicast.path_counts()))
+    loop.every(UPKEEP_S, lambda _now: two_paths.update(switch.multicast.path_counts()))
 
     def frames() -> dict[str, int]:
         """Return the frame counts by direction."""

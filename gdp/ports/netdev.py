@@ -65,7 +65,6 @@ class NetdevPlane(ABC):
         self._counters = Counters()
         self._came: Counter[int] = Counter()  # frames, by port
         self._polls = 0
-        self._is_idle = True  # the last poll met no event
         self._audited_at = 0  # frames that had come by the last audit
         self._audit_s = 0.0
         self._next_index = 0
@@ -130,8 +129,7 @@ class NetdevPlane(ABC):
         """Wait for events and serve them, the lowest rank first; return the punted frames, as ``Plane.poll``."""
         if self._unopened:
             timeout_s = self._open_again(timeout_s)
-        events = self._epoll.poll(timeout_s)
-        self._is_idle = not events
+        events = self._wait(timeout_s)
         self._polls += 1
         has_come = self._counters.frames_in >= self._audited_at + _AUDIT_FRAMES
         is_due = not events and (has_come or (timeout_s != 0 and time.monotonic() >= self._audit_s))
@@ -146,6 +144,10 @@ class NetdevPlane(ABC):
         arrivals, self._arrivals = self._arrivals, []
         self._counters.punted += len(arrivals)
         return arrivals
+
+    def _wait(self, timeout_s: float | None) -> list[tuple[int, int]]:
+        """Wait for events; return each as a descriptor and its flags."""
+        return self._epoll.poll(timeout_s)
 
     def _keep(self, arrivals: Sequence[ReceivedFrame]) -> None:
         """Let the next ``poll`` return these frames; those of one system call alone stay as they are."""

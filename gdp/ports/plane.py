@@ -79,8 +79,12 @@ class Keepalives(Protocol):
     def follow(self, offers: Sequence[KeepaliveOffer], ports: Mapping[int, Port]) -> list[KeepaliveRun]:
         """Run the sessions of these offers and no others; return the begin and the end of each where that is new."""
 
-    def poll(self, now_s: float) -> tuple[list[KeepaliveRun], float]:
-        """Return what happened in the sessions, and how late the plane was called, in seconds."""
+    def poll(self, now_s: float, *, reports: bool = False) -> tuple[list[KeepaliveRun], float]:
+        """Return what happened in the sessions that end, and how late the plane was called, in seconds.
+
+        Args:
+            reports: also what happened in the others.
+        """
 
 
 class Plane(Protocol):

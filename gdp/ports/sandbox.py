@@ -35,6 +35,7 @@ class Needs:
         tcp_ports: TCP ports on which it listens, and it opens no TCP connection; None: any.
         starts_programs: whether it starts programs; they get no capability.
         spared_calls: system calls of ``seccomp.denied`` that it makes.
+        uses_open_programs: as of ``seccomp.refuse``.
         only_reads: it makes no system call but those of ``seccomp.allowed``.
     """
 
@@ -44,6 +45,7 @@ class Needs:
     tcp_ports: tuple[int, ...] | None = None
     starts_programs: bool = False
     spared_calls: frozenset[str] = frozenset()
+    uses_open_programs: bool = False
     only_reads: bool = False
 
 
@@ -94,7 +96,7 @@ def confine(needs: Needs) -> Rights:
         if needs.only_reads:
             seccomp.allow_only_reading()
         else:
-            seccomp.refuse(needs.spared_calls)
+            seccomp.refuse(needs.spared_calls, uses_open_programs=needs.uses_open_programs)
     except OSError as error:
         log.warning("system calls kept reason=%s", error.strerror)
     return _rights(version)

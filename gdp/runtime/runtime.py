@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gdp.due_queue import earliest
-from gdp.intervals import LOOK_S, NEVER_S
+from gdp.intervals import LOOK_S, NEVER_S, UPKEEP_S
 from gdp.limits import COST_DEFAULT
 from gdp.ports.plane import HasFileno, Plane
 from gdp.runtime.busy_poll import BusyPoll
@@ -38,7 +38,8 @@ def now() -> Timestamps:
 class Periodic:
     """Function that a loop calls once in a period, and not while it has no work.
 
-    For up to a quarter of its period it waits until something else wakes the loop. Source: timerslack, prctl(2).
+    It is called up to a quarter of its period early or late, with what else wakes the loop, and kept on average: so
+    functions of several periods share a wake-up. Source: timerslack, prctl(2).
     """
 
     period_s: float
@@ -47,8 +48,8 @@ class Periodic:
     due_s: float = float("-inf")
 
     def handle(self, moment: Timestamps) -> None:
-        """Call the function if it is due; one that waited is due the sooner again."""
-        if moment.mono_s >= self.due_s and self.has_work():
+        """Call the function if it is due, or soon; one that waited is due the sooner again."""
+        if moment.mono_s >= self.due_s - self.period_s * _SLACK and self.has_work():
             self.due_s = max(self.due_s, moment.mono_s - self.period_s * _SLACK) + self.period_s
             self.call(moment)
 
@@ -74,7 +75,10 @@ class Runtime:
         self._deadline_s: float | None = None
         self._periodic: list[Periodic] = []
         self._after_receive: list[Callable[[], None]] = []
-        self._keepalives = plane.keepalives
+        self._keepalives = keepalives = plane.keepalives
+        self._has_reports = False
+        if keepalives is not None:
+            self.every(UPKEEP_S, self._take_reports, lambda: keepalives.due_s != NEVER_S)
         self._drain_until_s: float | None = None
         self._is_finished: Callable[[], bool] = lambda: True
         self.has_drained = False
@@ -215,12 +219,12 @@ class Runtime:
             self._machine.handle_timer(moment)
             self.send()  # keepalives and reports, of which most often no more follow
             has_news, self._deadline_s = True, None
-        if keepalives is not None and has_news:
+        for each in self._periodic:
+            each.handle(moment)
+        if keepalives is not None and (has_news or self._has_reports):
+            self._has_reports = False
             offers = self._machine.offload.offers(moment.mono_s)
             self._take_runs(keepalives.follow(offers, self._plane.ports), 0.0, moment)
-        for each in self._periodic:
-            if moment.mono_s >= each.due_s:
-                each.handle(moment)
 
     def _periodic_s(self) -> float | None:
         """Return until when the next periodic function waits; None: all wait for work."""
@@ -230,6 +234,12 @@ class Runtime:
             if (first_s is None or latest_s < first_s) and each.has_work():
                 first_s = latest_s
         return first_s
+
+    def _take_reports(self, moment: Timestamps) -> None:
+        """Tell the core what the plane did in the keepalive sessions that last."""
+        self._has_reports = True
+        if self._keepalives is not None:
+            self._take_runs(*self._keepalives.poll(moment.mono_s, reports=True), moment)
 
     def _take_runs(self, runs: list[KeepaliveRun], late_s: float, moment: Timestamps) -> None:
         """Tell the core what the plane did in keepalive sessions; of one that is over, timers may be due now."""

@@ -14,8 +14,8 @@ from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError, LocalError
-from gdp.intervals import TICK_S
-from gdp.links.uplink import open_uplink
+from gdp.intervals import UPKEEP_S
+from gdp.links.uplink import load_plane, open_uplink
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_settings, load_member
@@ -52,14 +52,14 @@ class SessionNode(Node):
         with ExitStack() as stack:
             stack.callback(_own(identity.name))
             super().__init__("node", member, config, stack, is_service=False, state_folder=config.state)
-            self.plane = stack.enter_context(open_uplink(config.iface))
+            self.plane = stack.enter_context(open_uplink(config.iface, load_plane("raw", stack)))
             self.runtime = Runtime(self.member, self.plane, spin_s=config.busy_poll_us / 1e6)
             labels = {topic.name: self.core.label(topic) for topic in topics}
             state = MemberState(identity, policy, self.plane, self.member, now().mono_s)
             state.local_name = lambda name: labels.get(name, name.short)
             self.drive(state, self.runtime)
             self.begin(self.runtime)
-            self.runtime.every(TICK_S, EpochTimer(self.reload_for_epoch).handle_timer)
+            self.runtime.every(UPKEEP_S, EpochTimer(self.reload_for_epoch).handle_timer)
             self._opened = stack.pop_all()
 
     def waiting_for(self) -> str:

@@ -41,7 +41,7 @@ _QUALITY_PER_S: Final = 10.0  # most points of quality that are regained in a se
 _SIZE_WEIGHT: Final = 0.25  # of the newest message in the mean size
 _RATE_WEIGHT: Final = 0.1  # of the newest gap in the mean gap of offered messages
 _EARLY: Final = 0.5  # of a period: no clock is exact
-# Bytes of a JPEG by quality, relative to quality 80, on recorded 640x480 frames (scripts/bench/reduce.py).
+# Bytes of a JPEG by quality, relative to quality 80, on recorded 640x480 frames.
 _SIZES: Final = (
     (1, 0.17),
     (10, 0.24),

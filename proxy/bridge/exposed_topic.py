@@ -18,6 +18,7 @@ from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.control_services import GIVE, SHOW, TAKE, ControlServices
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.encoder import MessageEncoder, description_of
 from proxy.bridge.core.reduction import adaptation_of, encoders_of
@@ -83,6 +84,8 @@ class ExposedTopic:
             self._describe((dispatcher.endpoint.channel(flow_spec.local, flow_spec.type_name),))
         except LocalError:
             self.publisher = None  # the first message brings its definition
+        acts = () if flow_spec.rule.control is None or not dispatcher.endpoint.is_live else (TAKE, GIVE, SHOW)
+        self._control = ControlServices(context, dispatcher, flow_spec, self._readers, *acts)
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local publishers."""
@@ -129,6 +132,7 @@ class ExposedTopic:
         """Publish nothing from now on."""
         if self._depth_probe is not None:
             self._depth_probe.close()
+        self._control.close()
         self._dispatcher.close(self.handle)
         self._context.member.flush(now_s)
 
@@ -154,6 +158,9 @@ class ExposedTopic:
         self._topic = topic
         if self.publisher is not None:
             self._context.member.renew(topic)
+
+    def _readers(self) -> list[Name]:
+        return [] if self.publisher is None else list(map(Name, self.publisher.matched.names()))
 
     def _subscribe(self) -> int:
         return self._dispatcher.subscribe(self, self._flow_spec.local, self._flow_spec.type_name, self.qos.request)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from gdp.capsule.late_join import LateJoin
@@ -22,6 +22,7 @@ from gdp.message.loss import Losses
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.control_services import GIVE, ControlServices
 from proxy.bridge.core.decoder import MessageDecoder, differences_of
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.exclusive_control import ExclusiveControl
@@ -62,6 +63,7 @@ class ImportedTopic:
         last_s: monotonic second of the newest message that arrived; None: there was none.
         is_joined: whether it is subscribed: a local node reads it.
         control: who is heard; None: every publisher.
+        unmatched: node and policy of each local reader whose QoS is not met, by key.
 
     Raises:
         LocalError: this graph does not accept a publisher of it, or the rule's message of stop does not fit its type.
@@ -73,7 +75,8 @@ class ImportedTopic:
         self._context = context
         self._flow_spec = flow_spec
         self._topic = topic
-        self._unmatched: Set[str] = frozenset()  # keys of readers whose QoS cannot be met
+        self._ends: Sequence[GraphEntity] = ()  # local readers
+        self.unmatched: dict[str, tuple[str, str]] = {}
         self._sources = DecoderCache[tuple[_Decoded, ...]]()
         self.is_joined = False
         self._past: LateJoin | None = None
@@ -99,11 +102,12 @@ class ImportedTopic:
         kind = MergedPublisher if dispatcher.endpoint.is_live else ChannelPublishers
         self._heard_s: dict[bytes, float] = {}  # when each publisher's last message came, the latest last
         self._output: LocalOutput = kind(dispatcher, self, flow_spec)
+        acts = () if self.control is None else (GIVE,)
+        self._services = ControlServices(context, dispatcher, flow_spec, lambda: [context.member.name], *acts)
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local readers."""
-        self.local_readers = len(ends)
-        self._tell_unmatched(ends)
+        self._ends, self.local_readers = ends, len(ends)
         if ends and not self.is_joined:
             self.is_joined = True
             keeper, history = self._context.keeper, self._flow_spec.rule.history
@@ -115,6 +119,7 @@ class ImportedTopic:
             self._leave()
             self._output.drop_kept()
         self._output.receive_readers(ends)
+        self._tell_unmatched()
         self._sources.forget_refused()  # other types may fit now
 
     def receive(self, message: Message, now_s: float) -> None:
@@ -184,6 +189,7 @@ class ImportedTopic:
 
     def close(self, now_s: float) -> None:
         """Close the subscription and the local publisher."""
+        self._services.close()
         if self.control is not None:
             self.control.give(None, now_s)
             self.handle_timer(now_s)
@@ -218,15 +224,17 @@ class ImportedTopic:
         self._past_losses.update(self._context.member.subscriptions.losses_of(self._topic.name))
         self._context.member.unsubscribe(self._topic.name)
 
-    def _tell_unmatched(self, ends: Sequence[GraphEntity]) -> None:
-        """Report once each reader whose QoS cannot be met."""
-        odd = {end.key: (end.node or "a node", policy) for end in ends if end.qos and (policy := unmatched(end.qos))}
-        for key in odd.keys() - self._unmatched:
-            detail = "{} will get nothing: {}, which no network can promise".format(*odd[key])
+    def _tell_unmatched(self) -> None:
+        """Report once each reader whose QoS is not met."""
+        offered = self._output.fulfilled
+        policies = ((end, unmatched(end.qos, offered)) for end in self._ends if end.qos is not None)
+        odd = {end.key: (end.node or "a node", policy) for end, policy in policies if policy}
+        for key in odd.keys() - self.unmatched.keys():
+            detail = "{} will get nothing: {}".format(*odd[key])
             self._context.faults.report(self._flow_spec.local, Fault.QOS, detail)
-        if self._unmatched and not odd:
+        if self.unmatched and not odd:
             self._context.faults.clear(self._flow_spec.local, Fault.QOS)
-        self._unmatched = odd.keys()
+        self.unmatched = odd
 
     def _refuse(self, fault: Fault, detail: str) -> None:
         self.stats.refused += 1
@@ -325,6 +333,7 @@ class ImportedTopic:
         except LocalError as error:
             self._context.faults.report(what, self._output.refusal, str(error))
             return None
+        self._tell_unmatched()
         return tuple(map(_Decoded, expanders, incoming, rewriters, handles))
 
     def _rewriter(self, channel: Channel) -> HeaderRewriter | None:

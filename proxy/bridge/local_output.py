@@ -36,6 +36,10 @@ class LocalOutput(Protocol):
     def is_open(self) -> bool:
         """Return whether messages can be published now."""
 
+    @property
+    def fulfilled(self) -> Qos | None:
+        """Return what local readers are offered of known remote publishers' QoS; None: none is known."""
+
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
         """Return the decoder that turns bodies of a remote channel into local messages."""
 
@@ -87,6 +91,11 @@ class MergedPublisher:
     def is_open(self) -> bool:
         """Return whether the virtual publisher exists."""
         return self._handle is not None
+
+    @property
+    def fulfilled(self) -> Qos | None:
+        """Return what is offered, once a remote publisher is known."""
+        return self._channel.qos[0] if self._far and self._channel is not None else None
 
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
         """Return a decoder by the remote definition that converts into this machine's."""
@@ -144,7 +153,7 @@ class MergedPublisher:
         rule = self._flow_spec.rule
         stated = () if rule.offered is None else (Qos(**rule.offered.model_dump()),)
         far, latched, reliable = tuple(self._far.values()) or stated, rule.wants_latched, rule.wants_reliable
-        profile = offer(far, self._wants, is_latched=latched, is_reliable=reliable)
+        profile = offer(far, self._wants, is_latched=latched, is_reliable=reliable, is_known=bool(self._far))
         latched = profile.durability == "transient_local"
         offered = replace(channel, topic=self._flow_spec.local, qos=(profile,), latched=latched, callerid=None)
         if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):
@@ -162,6 +171,7 @@ class ChannelPublishers:
 
     refusal = Fault.REFUSED
     is_open = True
+    fulfilled = None
 
     def __init__(self, dispatcher: EndpointDispatcher, owner: EventHandler, flow_spec: FlowSpec) -> None:
         self._dispatcher = dispatcher

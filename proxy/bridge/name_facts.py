@@ -27,7 +27,6 @@ from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import GraphEntity, Role
-from proxy.endpoints.core.qos import unmatched
 
 _FLOWS_MAX: Final = 16
 _KNOWN_MAX: Final = 64
@@ -190,7 +189,7 @@ def _flow_fact(
         "nodes": len(ends),
         "other_types": tuple(sorted({end.type_name for end in under} - {meant.type_name, ""}))[:4],
         "qos": tuple(sorted({f"{end.qos.reliability}, {end.qos.durability}" for end in ends if end.qos is not None})),
-        "odd_qos": tuple(_odd_qos(ends)) if not meant.is_exposed else (),
+        "odd_qos": tuple(map(": ".join, flow.unmatched.values())) if isinstance(flow, ImportedTopic) else (),
         "right": right.value,
         "faults": {label: count for label, (count, _) in faults.items()},
         "details": {label: detail[:_DETAIL_CHARS] for label, (_, detail) in faults.items()},
@@ -215,12 +214,6 @@ def _flow_fact(
     elif isinstance(flow, ImportedService):
         known["ranking"] = tuple(flow.ranking(now.mono_s)[:_RANKED_MAX])
     return FlowFact(**known)  # type: ignore[arg-type]
-
-
-def _odd_qos(ends: Sequence[GraphEntity]) -> Iterator[str]:
-    for end in ends:
-        if end.qos is not None and (why := unmatched(end.qos)):
-            yield f"{end.node or 'a node'}: {why}"
 
 
 def _rights(

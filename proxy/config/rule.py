@@ -298,7 +298,9 @@ class Rule(Section):
     stamps: Literal["as-sent", "local"] = Field(
         default="as-sent", description="Imported topics: stamps of headers, by the sender's clock or by that of here."
     )
-    control: SomeControl = Field(default=None, description="Imported topics: one far publisher at a time is heard.")
+    control: SomeControl = Field(
+        default=None, description="Imported topics: one far publisher is heard. Exposed: services to take control."
+    )
     compress: SomeCompress = Field(default=None, description="Exposed topics: compressed bodies.")
     image: PictureFormat | None = Field(
         default=None, description="Exposed sensor_msgs/msg/Image: travels so; needs the extra `images`."

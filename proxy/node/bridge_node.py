@@ -106,10 +106,10 @@ def open_tracer(traces: Traces | None, node: Name, label: str) -> CallTracer:
 def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
     """Run until stopped, and report progress."""
     is_ready = False
-    tick_at_s = 0.0
     leave_at_s: float | None = None
+    node.runtime.every(TICK_S, lambda _: _tell_progress(node, bridge), lambda: json and is_ready)
     while not node.runtime.is_stopped:
-        now_s = node.step(bridge, tick_at_s)
+        now_s = node.step(bridge, None if leave_at_s is None else time.monotonic() + TICK_S)
         if node.is_leaving:
             if leave_at_s is None:
                 log.info("leaving; what is under way is answered")
@@ -127,10 +127,6 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
         if is_ready:
             for change in bridge.poll_changes():
                 _tell_change(change, json=json)
-        if now_s >= tick_at_s:
-            tick_at_s = now_s + TICK_S
-            if json and is_ready:
-                _tell_progress(node, bridge)
 
 
 def _tell_change(change: FlowChange, *, json: bool) -> None:

@@ -18,6 +18,7 @@ from gdp.limits import MARK_MAX_CHARS
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from proxy.bridge.bridge import Bridge
+from proxy.bridge.control_services import ASK, GIVE, SHOW, TAKE
 from proxy.bridge.core.exclusive_control import ExclusiveControl
 from proxy.bridge.faults import Fault
 from proxy.bridge.flow_rows import control_row
@@ -26,12 +27,10 @@ from proxy.node.proxy_state import ProxyState
 
 log = logging.getLogger(__name__)
 
-ASK: Final = "control"
 MARK: Final = "mark"
 _NAME: Final = Keyed("mark", text(MARK_MAX_CHARS))
 _LABEL_MAX_CHARS: Final = 256
-_SHOW: Final = "show"
-_ACT: Final = Keyed("do", text(8), absent=_SHOW)
+_ACT: Final = Keyed("do", text(8), absent=SHOW)
 _AT: Final = Keyed("at", uint(), absent=0)  # the asker's wall clock, Unix nanoseconds
 _FORCE: Final = Keyed("force", FLAG, absent=False)
 _SEEN: Final = Keyed("seen", uint(), absent=0)  # generation
@@ -47,7 +46,7 @@ def answer_control(state: ProxyState, bridge: Bridge) -> None:
             return {}
         flow, control = found
         error = ""
-        if (act := _ACT.read(question.body)) != _SHOW:
+        if (act := _ACT.read(question.body)) != SHOW:
             try:
                 _act(act, flow, control, question, now.mono_s, state.identity.name)
             except LocalError as refused:
@@ -77,11 +76,11 @@ def _act(act: str, flow: ImportedTopic, control: ExclusiveControl, question: Que
     asker, body = question.asker.name, question.body
     if _SEEN.read(body) != control.generation:
         raise LocalError("control has changed meanwhile; look who holds it, and ask again")
-    if act == "take":
+    if act == TAKE:
         if asker not in flow.publishers:
             raise LocalError("only a publisher of the topic may take its control, and none of this node is known here")
         control.take(asker, now_s, since_ns=_AT.read(body), force=_FORCE.read(body))
-    elif act == "give":
+    elif act == GIVE:
         if asker not in (control.holder, own):
             raise LocalError("only who holds control may give it; take it with 'gdp control take'")
         control.give(_publisher(flow, _TO.read(body)), now_s)

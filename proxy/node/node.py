@@ -14,9 +14,10 @@ from types import FrameType
 from gdp.client.clock_exchange import ClockExchange
 from gdp.client.participant import Participant, Topic
 from gdp.crypto.certificates import Role
+from gdp.due_queue import earliest
 from gdp.errors import GdpError, LocalError
-from gdp.intervals import GOODBYE_S, LINGER_S, TICK_S
-from gdp.links.uplink import open_uplink
+from gdp.intervals import GOODBYE_S, LINGER_S, UPKEEP_S
+from gdp.links.uplink import load_plane, open_uplink
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore, EpochTimer
 from gdp.nodes.membership import fresh_settings, load_member
@@ -50,7 +51,7 @@ class ProxyNode(Node):
         member = load_member(config.identity, config.domain, Role.PROXY)
         super().__init__("proxy", member, config, stack, state_folder=config.state)
         self.member = Participant(self.identity, self.policy, fresh_settings(config.lease_s))
-        plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
+        plane = stack.enter_context(open_uplink(config.iface, load_plane(config.data_plane, stack)))
         self.runtime = Runtime(self.member, plane, spin_s=config.busy_poll_us / 1e6)
         self.state = ProxyState(self.identity, self.policy, plane, self.member, now().mono_s, _rule_names(config))
         self.on_reload: Callable[[], None] | None = None
@@ -103,13 +104,12 @@ class ProxyNode(Node):
         bridge.close()
         self.leave()
 
-    def step(self, bridge: Bridge, latest_s: float) -> float:
+    def step(self, bridge: Bridge, latest_s: float | None = None) -> float:
         """Wait for an event, no longer than until a monotonic second, and have the bridge handle it; return the time.
 
         All pending messages are flushed once, so that small ones share a seal.
         """
-        due_s = bridge.get_timer()
-        self.runtime.step(latest_s if due_s is None else min(due_s, latest_s))
+        self.runtime.step(earliest(bridge.get_timer(), latest_s))
         return self.work(bridge)
 
     def work(self, bridge: Bridge) -> float:
@@ -141,8 +141,8 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         node = ProxyNode(config, stack, on_wait)
         runtime = node.runtime
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
-        runtime.every(TICK_S, EpochTimer(node.reload_on_signal).handle_timer)
-        runtime.every(TICK_S, ClockExchange(node.member).work)
+        runtime.every(UPKEEP_S, EpochTimer(node.reload_on_signal).handle_timer)
+        runtime.every(UPKEEP_S, ClockExchange(node.member).work)
         sources = common_sources(node.node_log, proxy_sources(node.state))
         handlers = replace(
             proxy_handlers(node.state, sources),

@@ -75,9 +75,11 @@ def _writer(record: Record | None) -> SplitWriter | None:
 def _work(node: ProxyNode, bridge: Bridge, writer: SplitWriter | None, *, json: bool) -> None:
     """Receive until stopped, or until nothing can be written any more; report progress."""
     is_ready = False
-    tick_at_s = 0.0
+    node.runtime.every(TICK_S, lambda _: _report_progress(bridge.stats), lambda: json and is_ready)
+    if writer is not None:
+        node.runtime.every(TICK_S, lambda _: writer.flush())
     while not node.runtime.is_stopped:
-        now_s = node.step(bridge, tick_at_s)
+        node.step(bridge)
         if writer is not None and writer.failure:
             return
         if not is_ready and node.member.attachment.is_attached:
@@ -85,12 +87,6 @@ def _work(node: ProxyNode, bridge: Bridge, writer: SplitWriter | None, *, json: 
             node.tell_refusals()
             name = node.member.name
             report("ready", f"proxy {name.short} is attached; Ctrl-C ends it", json=json, name=name.to_text())
-        if now_s >= tick_at_s:
-            tick_at_s = now_s + TICK_S
-            if writer is not None:
-                writer.flush()
-            if json and is_ready:
-                _report_progress(bridge.stats)
 
 
 def _report_progress(stats: Sequence[TopicStats]) -> None:

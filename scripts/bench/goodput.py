@@ -5,7 +5,6 @@ in each direction. Images of 921,600 bytes are due 30 times a second, which is m
 that waits misses some. Whole images that arrive in the window count.
 
     sudo .venv/bin/python scripts/bench/goodput.py                  # writes docs/benchmarks/goodput.json
-    sudo .venv/bin/python scripts/bench/goodput.py --loss 5 --no-save
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Final
 
 from report import Rounds
 from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
-from thin_link.conditions import LOSSES, Conditions
+from thin_link.conditions import Conditions
 from thin_link.line import thin_link_lab
 from thin_link.systems import SYSTEMS
 from thin_link.traffic import CAMERA_BYTES, RELIABLE, streams
@@ -26,14 +25,14 @@ from lab.process import new_run
 
 GOODPUT, SHARE, LATE = "goodput, Mbit/s", "link share", "relay late p99, ms"
 ROWS: Final = (OURS, "zenoh-tls-block", "zenoh-quic-block")
-RATE, RTT_MS = "100", 60.0  # Mbit/s
+RATE, RTT_MS, LOSS = "100", 60.0, "1"  # Mbit/s, ms, % of frames
 TARGET: Final = 5.0
 _IMAGE: Final = streams(RELIABLE)[0]
 
 
 def goodput(lab: Lab, link: Conditions, name: str, options: Options, _: int) -> dict[str, float]:
     """Return the figures of one system on a link."""
-    used, reports = exchange(lab, link, SYSTEMS[name], options, with_tcp=False)
+    used, reports = exchange(lab, link, SYSTEMS[name], RELIABLE, options.seconds, with_tcp=False)
     return {
         GOODPUT: reports[_IMAGE.name].whole * 8 * CAMERA_BYTES["raw"] / options.seconds / 1e6,
         SHARE: used.up.share,
@@ -44,7 +43,7 @@ def goodput(lab: Lab, link: Conditions, name: str, options: Options, _: int) -> 
 def measure(options: Options) -> Outcome:
     """Measure every system, round by round."""
     recorder = Recorder()
-    link = Conditions.of(RATE, RTT_MS, options.loss, "bdp", seed=1)
+    link = Conditions.of(RATE, RTT_MS, LOSS, "bdp", seed=1)
     for number in range(1, options.rounds + 1):
         with new_run() as run:
             lab = thin_link_lab(run)
@@ -64,6 +63,4 @@ def measure(options: Options) -> Outcome:
 
 if __name__ == "__main__":
     parser = command_line(__doc__, rounds=3, seconds=15.0, quick={"rounds": 1, "seconds": 3.0}, has_record=True)
-    parser.add_argument("--loss", choices=list(LOSSES), default="1", help="of frames, %% (default: %(default)s)")
-    parser.set_defaults(camera=RELIABLE)
     run_bench(parser, measure)

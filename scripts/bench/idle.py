@@ -1,8 +1,9 @@
 """Idle bench: what commands take, and what nodes take to start and at rest: processor time and memory.
 
 Three switches in a row, their RIB and a recorder with default settings, in namespaces; then a switch with twenty
-neighbours. A start is the processor time until a node is ready. At rest neighbours exchange keepalives alone. Memory is
-PSS, in which processes share what they have in common.
+neighbours. A start is the processor time until a node is ready. At rest neighbours exchange keepalives alone. A wake-up
+is a wait of a thread that ended (voluntary context switch). Memory is PSS, in which processes share what they have in
+common.
 
     sudo .venv/bin/python scripts/bench/idle.py --allow-load --no-save
 """
@@ -14,6 +15,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -31,7 +33,8 @@ COMMANDS: Final = (
     "gdp --version", "gdp --help", "gdp name --kind topic --name /a", "gdp show links", "gdp topic -h",
     "gdp-switch -h", "gdp-proxy -h",
 )  # fmt: skip
-WALL, CPU, START, IDLE, PSS = "wall, s", "CPU, s", "start CPU, s", "at rest, % of a core", "PSS, MB"
+WALL, CPU, START, PSS = "wall, s", "CPU, s", "start CPU, s", "PSS, MB"
+IDLE, WAKES = "at rest, % of a core", "at rest, wake-ups/s"
 HUB: Final = "switch with 20 neighbours"
 LIMITS: Final = {WALL: 0.15, START: 0.5, IDLE: 0.5, PSS: 45.0}
 HUB_LIMIT: Final = 1.0
@@ -60,6 +63,25 @@ def pss_mb(pid: int) -> float:
     return int(rollup.partition("\nPss:")[2].split()[0]) / 1024
 
 
+def wakes(pid: int) -> int:
+    """Return how often the threads of a process have waited."""
+    tasks = Path(f"/proc/{pid}/task").glob("*/status")
+    texts = [each.read_text(encoding="ascii", errors="replace") for each in tasks]
+    return sum(int(each.partition("\nvoluntary_ctxt_switches:")[2].split()[0]) for each in texts)
+
+
+def at_rest(pids: Mapping[str, int], seconds: float) -> Figures:
+    """Return the processor time and the wake-ups of processes that are left alone."""
+    time.sleep(_SETTLE_S)
+    before, begun_s = {name: (processor_s(pid), wakes(pid)) for name, pid in pids.items()}, time.monotonic()
+    time.sleep(seconds)
+    found, took_s = dict[str, dict[str, float]](), time.monotonic() - begun_s
+    for name, pid in pids.items():
+        busy_s, woken = before[name]
+        found[name] = {IDLE: 100 * (processor_s(pid) - busy_s) / took_s, WAKES: (wakes(pid) - woken) / took_s}
+    return found
+
+
 def nodes(lab: Lab, seconds: float) -> Figures:
     """Return the figures of each node."""
     with BenchNodes(lab, lab.topology.nodes, plane="auto") as running:
@@ -70,21 +92,14 @@ def nodes(lab: Lab, seconds: float) -> Figures:
         proxy = lab.start(at.switch, "proxy", ["-m", PROGRAMS["proxy"], "--json", "--config", str(file)])
         proxy.read(30.0)
         pids["proxy"], starts["proxy"] = proxy.pid, processor_s(proxy.pid)
-        time.sleep(_SETTLE_S)
-        before = {name: processor_s(pid) for name, pid in pids.items()}
-        time.sleep(seconds)
-        rest = {name: 100 * (processor_s(pid) - before[name]) / seconds for name, pid in pids.items()}
-        return {name: {START: starts[name], IDLE: rest[name], PSS: pss_mb(pid)} for name, pid in pids.items()}
+        rest = at_rest(pids, seconds)
+        return {name: {START: starts[name], **rest[name], PSS: pss_mb(pid)} for name, pid in pids.items()}
 
 
 def hub(lab: Lab, seconds: float) -> Figures:
     """Return the figure at rest of a switch with nineteen switches and a RIB."""
     with BenchNodes(lab, lab.topology.nodes, plane="auto") as running:
-        pid = running.running["switch", "hub"].pid
-        time.sleep(_SETTLE_S)
-        before = processor_s(pid)
-        time.sleep(seconds)
-        return {HUB: {IDLE: 100 * (processor_s(pid) - before) / seconds}}
+        return at_rest({HUB: running.running["switch", "hub"].pid}, seconds)
 
 
 def star() -> Topology:

@@ -26,6 +26,7 @@ from itertools import product
 from typing import Final
 
 from background_load import LOADS, SHARE, load_of
+from machine import signature_pair_s
 from peers.chain import Chain
 from peers.exchange import ANSWER
 from peers.systems import BASELINES, Baseline
@@ -39,11 +40,14 @@ from lab.process import new_run
 MEDIAN: Final = "RTT median, ms"
 P99: Final = "RTT p99, ms"
 CPU: Final = {"sender": "sender CPU, ms", "receiver": "receiver CPU, ms", "between": "CPU between, ms"}
-COLUMNS: Final = (MEDIAN, P99, *CPU.values())
+UNSIGNED: Final = "less ECDSA, ms"
+COLUMNS: Final = (MEDIAN, P99, UNSIGNED, *CPU.values())
 SMALL, IMAGE = 100, 921_600
 TIMES: Final = {SMALL: 4, IMAGE: 1}  # of ``count`` messages, by size
 MTUS: Final = (1_500, 9_000)
 OURS: Final = tuple(name for name in BASELINES if name.startswith("gdp"))
+_SIGNED: Final = "gdp-kernel"
+_PAIRS: Final = {_SIGNED: 2}  # ECDSA signatures and checks of a message and its answer
 _SECURED: Final = "zenoh-mtls"
 _UNSECURED: Final = "cyclone"
 _RATIOS: Final = {  # bytes, MTU, whether the cores are half taken: at most
@@ -55,6 +59,7 @@ _RATIOS: Final = {  # bytes, MTU, whether the cores are half taken: at most
     (SMALL, 9_000, True): 0.8,
     (IMAGE, 9_000, True): 0.6,
 }
+_UNSIGNED_RATIO: Final = 0.4
 _ADDED_MS: Final = 1.5
 _SMALL_CPU_MS: Final = 0.12
 
@@ -66,12 +71,16 @@ def case_of(size: int, mtu: int, *, loaded: bool) -> str:
     return f"{size:,} B, MTU {mtu}{', cores half taken' if loaded else ''}"
 
 
-def measure_one(baseline: Baseline, chain: Chain, size: int, count: int, loaded: bool, _: int) -> Mapping[str, float]:
-    """Return the figures of one baseline in one case, by column."""
+def measure_one(
+    baseline: Baseline, chain: Chain, size: int, count: int, loaded: bool, pairs: int, _: int
+) -> Mapping[str, float]:
+    """Return the figures of one baseline in one case, by column; a round trip has ``pairs`` of signature and check."""
     with load_of(loaded=loaded):
         found = baseline(chain, size=size, count=count)
+        signed_s = pairs * signature_pair_s()
     times_s: Sequence[float] = found["rtt_s"]
     figures = {MEDIAN: 1e3 * percentile(times_s, 0.5), P99: 1e3 * percentile(times_s, 0.99)}
+    figures[UNSIGNED] = figures[MEDIAN] - 1e3 * signed_s
     return figures | {CPU[place]: 1e3 * float(cpu_s) for place, cpu_s in found["cpu_s"].items()}
 
 
@@ -84,6 +93,9 @@ def targets_of(over: Rounds, ours: Iterable[str], cases: Sequence[Case]) -> list
         if each in _RATIOS:
             what = f"{label} / {_SECURED}, {case}"
             targets.append(over.ratio(what, label, _SECURED, case, MEDIAN, _RATIOS[each], at_most=True))
+        if size == SMALL and not loaded and label == _SIGNED:
+            what = f"{label} less two signatures and checks / {_SECURED}, {case}"
+            targets.append(over.ratio(what, label, _SECURED, case, UNSIGNED, _UNSIGNED_RATIO, at_most=True))
         if size == SMALL and not loaded:
             targets += [
                 over.target(f"{label}, {case}, {CPU[end]}", label, case, CPU[end], _SMALL_CPU_MS, at_most=True)
@@ -107,7 +119,15 @@ def measure(options: Options) -> Outcome:
                 case_of(size, mtu, loaded=loaded),
                 name,
                 COLUMNS,
-                partial(measure_one, BASELINES[name], chains[mtu], size, TIMES[size] * options.count, loaded),
+                partial(
+                    measure_one,
+                    BASELINES[name],
+                    chains[mtu],
+                    size,
+                    TIMES[size] * options.count,
+                    loaded,
+                    _PAIRS.get(name, 0),
+                ),
             )
             for (size, mtu, loaded), name in product(cases, names)
         ]

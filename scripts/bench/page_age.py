@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Check of the age of measured pages: none is older than 300 commits, or than the last change of what it measures.
+"""Check of the age of measured pages: none is older than the last change of what it measures.
 
     .venv/bin/python scripts/bench/page_age.py             # exit 1: a page is old; exit 2: no history to compare with
     .venv/bin/python scripts/bench/page_age.py --warn      # the same as one line, and exit 0: for a change
@@ -21,9 +21,7 @@ import yaml
 from machine import ROOT, RefusedError, git
 
 LISTS: Final = Path(__file__).with_name("pages.yaml")
-COMMITS_MAX: Final = 300
 _SCRIPTS: Final = {"experiments": "scripts/experiments", "benchmarks": "scripts/bench"}
-_DERIVED: Final = "results"  # the table of the others
 
 
 def main(words: Sequence[str] | None = None, root: Path = ROOT, lists: Path = LISTS) -> None:
@@ -54,8 +52,6 @@ def old_pages(root: Path, lists: dict[str, dict[str, list[Any]]]) -> Iterator[tu
         raise RefusedError(f"{root} is no git repository: clone it by git") from error
     for kind, scripts in _SCRIPTS.items():
         for path in sorted((root / "docs" / kind).glob("*.json")):
-            if path.stem == _DERIVED:
-                continue
             listed = lists[kind].get(path.stem)
             paths = [f"{scripts}/{path.stem}.py", *flat(listed or [])]
             reasons = (_reason(commit, paths, root) for commit in sorted(_commits(json.loads(path.read_text()))))
@@ -70,12 +66,9 @@ def _reason(commit: str, paths: Sequence[str], root: Path) -> str:
     if commit.endswith("-dirty"):
         return f"measured with changes to {commit.removesuffix('-dirty')} that no commit has"
     try:
-        count = int(git("rev-list", "--count", f"{commit}..HEAD", root=root))
+        changed = git("log", "-1", "--format=%h %s", f"{commit}..HEAD", "--", *paths, root=root)
     except subprocess.CalledProcessError:
         return f"its commit {commit} is not in this repository"
-    if count > COMMITS_MAX:
-        return f"{count} commits old"
-    changed = git("log", "-1", "--format=%h %s", f"{commit}..HEAD", "--", *paths, root=root)
     return f"older than {changed}" if changed else ""
 
 

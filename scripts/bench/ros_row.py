@@ -54,7 +54,6 @@ class Row(UndoneOnExit):
         mtu: of every device, the cable included; that of the ring is its own.
         bridged: whether the direct path leads through three bridges instead of one cable.
         ring: the overlay in place of the row: A and B are its first and its last switch.
-        cores: of each machine of the ring; None: the machines share all cores.
         program: of the proxies, before ``--config``.
 
     Raises:
@@ -70,7 +69,6 @@ class Row(UndoneOnExit):
         mtu: int,
         bridged: bool = False,
         ring: Topology | None = None,
-        cores: Mapping[str, int] | None = None,
         program: Sequence[str] = ("-m", "proxy.cli.proxy"),
     ) -> None:
         overlay = ring or flat_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
@@ -81,7 +79,7 @@ class Row(UndoneOnExit):
         cables = tuple(Link(a, b, mtu=mtu) for a, b in pairwise(direct))
         domains = (*overlay.domains, *([DomainPlan("direct", bridges)] if bridges else []))
         topology = Topology((*overlay.links, *cables), domains, overlay.attachments)
-        self._lab = Lab(run, topology, own_shared_memory=tuple(self._machines.values()), cores=cores)
+        self._lab = Lab(run, topology, own_shared_memory=tuple(self._machines.values()))
         for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
             self._lab.namespaces[node].bridge(_BRIDGE, (before, after))
         for side, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):

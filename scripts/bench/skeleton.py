@@ -110,7 +110,7 @@ def command_line(
         rounds: default of ``--rounds``; None: no such option.
         seconds: default of ``--seconds``; None: no such option.
         quick: what ``--quick`` sets; None: no such option.
-        has_record: adds ``--json``, ``--no-save``, ``--strict`` and ``--allow-load``.
+        has_record: adds ``--json``, ``--no-save`` and ``--allow-load``.
         has_plot: adds ``--no-plot``.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -125,7 +125,6 @@ def command_line(
     if has_record:
         parser.add_argument("--json", type=Path, help="where the figures go (default: docs/benchmarks)")
         parser.add_argument("--no-save", action="store_true", help="print only")
-        parser.add_argument("--strict", action="store_true", help="exit 1 when a target was missed")
         add_allow_load(parser)
     if has_plot:
         parser.add_argument("--no-plot", action="store_true", help="no picture")
@@ -215,6 +214,5 @@ def finish(
         write_json(record, outcome.name, state, settings, outcome.rounds, outcome.targets, keeps=outcome.keeps_rows)
     if is_drawn and own:
         save_bars(own / f"{outcome.name}.png", outcome.title, str(state), outcome.panels)
-    is_missed = any(target.met is False for target in outcome.targets)
-    if outcome.has_failed or (getattr(options, "strict", False) and is_missed):
+    if outcome.has_failed:
         sys.exit(1)

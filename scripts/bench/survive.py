@@ -167,6 +167,5 @@ if __name__ == "__main__":
     quick = {"rounds": 1, "dead_s": 3.0, "settle_s": 0.0}
     parser = command_line(__doc__, rounds=ROUNDS, quick=quick, has_record=True)
     parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
-    parser.add_argument("--dead-s", type=float, default=DEAD_S, help="how long no RIB lives (default: %(default)s)")
-    parser.set_defaults(settle_s=SETTLE_S)
+    parser.set_defaults(dead_s=DEAD_S, settle_s=SETTLE_S)
     run_bench(parser, measure)

@@ -44,7 +44,7 @@ class Row:
         fail: makes the event happen; gets the overlay and the number of the round, from 0. Faults that it leaves are
             undone; without one, the next event starts from this state.
         new_name_s: most seconds until a new name is read; None: not measured.
-        holds: the event lasts for the bench's ``--dead-s``.
+        holds: the event lasts for ``DEAD_S`` of the bench.
     """
 
     what: str

@@ -32,7 +32,7 @@ from skeleton import Options, Outcome, Recorder, Trial, command_line, run_bench
 from thin_link import score
 from thin_link.conditions import FIFOS, LOSSES, Conditions
 from thin_link.exchange import Tally
-from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
+from thin_link.line import ADDRESSES, CLOUD, ROBOT, TCP_CONTROL, Used, open_line, thin_link_lab
 from thin_link.score import LINK_COLUMNS, STREAM_COLUMNS, link_figures, merged, stream_figures, whole_share
 from thin_link.systems import SYSTEMS, System, run_window, start_role
 from thin_link.traffic import CAMERA_BYTES, carried_s, streams, wire_bytes
@@ -52,6 +52,7 @@ GRID: Final = (  # rate, round trip in ms, loss, FIFO
 RECORDED: Final = ("Verizon-LTE-short", 60.0, "0", "second")
 RTTS_MS: Final = (10.0, 60.0, 200.0)
 WARM_UP_S: Final = 3.0
+SEED: Final = 1  # of the losses
 READY_S: Final = 30.0
 RAW_CAMERA_BITS_S: Final = 50e6  # from this rate on, the camera is not compressed
 _FIGURES: Final = {"cmd_vel": 15.0, "tf": 15.0}  # asked: age p99 over idle, ms
@@ -66,10 +67,8 @@ def case_of(link: Conditions, what: str) -> str:
     return f"{link.name}: {what}"
 
 
-def camera_of(link: Conditions, choice: str) -> str:
-    """Return the camera on a link: the chosen one, or by its rate."""
-    if choice != "auto":
-        return choice
+def camera_of(link: Conditions) -> str:
+    """Return the camera on a link, by its rate."""
     return "raw" if link.up.bits_s >= RAW_CAMERA_BITS_S else "jpeg"
 
 
@@ -83,43 +82,43 @@ def links_of(options: Options) -> list[Conditions]:
     if any(chosen):
         words = list(product(*(each or [usual] for each, usual in zip(chosen, GRID[0], strict=True))))
     try:
-        return [Conditions.of(*each, seed=options.seed, traces=options.traces) for each in words]
+        return [Conditions.of(*each, seed=SEED, traces=options.traces) for each in words]
     except LocalError as error:
         raise RefusedError(str(error)) from error
 
 
 def exchange(
-    lab: Lab, link: Conditions, system: System | None, options: Options, *, with_tcp: bool
+    lab: Lab, link: Conditions, system: System | None, camera: str, seconds: float, *, with_tcp: bool
 ) -> tuple[Used, Mapping[str, Tally]]:
     """Run the traffic of a system once (None: no system), with or without the TCP flow; return use and reports.
 
     Raises ``FailedError``: a process did not come up, or ended.
     """
-    camera = camera_of(link, options.camera)
     with ExitStack() as stack:
         line = stack.enter_context(open_line(lab, link))
         ends = stack.enter_context(system(lab, camera)) if system else ()
         if with_tcp:
             stack.enter_context(start_role(lab, CLOUD, "tcp-read", {"address": ADDRESSES[CLOUD]})).read(READY_S)
             stack.enter_context(start_role(lab, ROBOT, "tcp-send", {"address": ADDRESSES[CLOUD]})).read(READY_S)
-        (used,), said = run_window([line], ends, options.seconds, WARM_UP_S)
+        (used,), said = run_window([line], ends, seconds, WARM_UP_S)
     return used, merged(streams(camera), *(each["streams"] for each in said)) if said else {}
 
 
 def measure_system(lab: Lab, link: Conditions, name: str, options: Options, over: Rounds, _: int) -> dict[str, float]:
     """Return the figures of a system on a link, and add those of its streams."""
+    camera, seconds = camera_of(link), options.seconds
     if name == TCP:
-        used = exchange(lab, link, None, options, with_tcp=True)[0]
+        used = exchange(lab, link, None, camera, seconds, with_tcp=True)[0]
         return {score.TCP_ALONE: used.up.marked_share, score.RELAY_LATE: used.late_ms}
-    mix = streams(camera_of(link, options.camera))
-    used, reports = exchange(lab, link, SYSTEMS[name], options, with_tcp=False)
-    could_s = carried_s(mix, 8 * used.up.capacity_bytes / options.seconds, link.up.loss)
+    mix = streams(camera)
+    used, reports = exchange(lab, link, SYSTEMS[name], camera, seconds, with_tcp=False)
+    could_s = carried_s(mix, 8 * used.up.capacity_bytes / seconds, link.up.loss)
     for each in mix:
-        found = stream_figures(each, reports[each.name], link, mix, could_s, options.seconds)
+        found = stream_figures(each, reports[each.name], link, mix, could_s, seconds)
         for column in STREAM_COLUMNS if each.bulk else STREAM_COLUMNS[:-1]:
             over.add(name, case_of(link, each.name), column, found.get(column))
-    both = exchange(lab, link, SYSTEMS[name], options, with_tcp=True)[0] if options.tcp else None
-    return {**link_figures(link, used, both), score.WHOLE: whole_share(mix, reports, could_s, options.seconds)}
+    both = exchange(lab, link, SYSTEMS[name], camera, seconds, with_tcp=True)[0] if options.tcp else None
+    return {**link_figures(link, used, both), score.WHOLE: whole_share(mix, reports, could_s, seconds)}
 
 
 def trials_of(lab: Lab, link: Conditions, options: Options, over: Rounds) -> list[Trial]:
@@ -142,14 +141,14 @@ def better_zenoh(over: Rounds, case: str, column: str, *, at_most: bool) -> str:
     return (min if at_most else max)(spreads, key=lambda name: spreads[name].median)
 
 
-def targets_of(over: Rounds, links: Sequence[Conditions], choice: str) -> list[Target]:
+def targets_of(over: Rounds, links: Sequence[Conditions]) -> list[Target]:
     """Return the targets of ours on each link, and the ratios to the better Zenoh transport."""
     targets = []
     for link in links:
         for stream, asked in _FIGURES.items():
             case = case_of(link, stream)
             targets.append(over.target(f"{case}, {score.OVER_IDLE}", OURS, case, score.OVER_IDLE, asked, at_most=True))
-        case, camera = case_of(link, "camera"), camera_of(link, choice)
+        case, camera = case_of(link, "camera"), camera_of(link)
         age_ms = _AGE_MS + wire_bytes(CAMERA_BYTES[camera]) * 8e3 / link.up.bits_s
         targets.append(over.target(f"{case}, {score.AGE_P99}", OURS, case, score.AGE_P99, age_ms, at_most=True))
         share = _SATURATED_SHARE if camera == "raw" else _FRESH_SHARE
@@ -175,7 +174,7 @@ def measure(options: Options) -> Outcome:
     for number in range(1, options.rounds + 1):
         for link in links:
             with new_run() as run:
-                lab = thin_link_lab(run, tcp_control=options.tcp_control)
+                lab = thin_link_lab(run)
                 for trial in trials_of(lab, link, options, recorder.rounds):
                     recorder.attempt(trial, number, options.rounds)
     over = recorder.rounds
@@ -183,14 +182,14 @@ def measure(options: Options) -> Outcome:
         "uplink",
         "A robot's traffic over a thin link with a plain FIFO",
         over,
-        targets_of(over, links, options.camera) if not options.only or OURS in options.only else [],
+        targets_of(over, links) if not options.only or OURS in options.only else [],
         {
             "seconds of each figure": options.seconds,
             "warm-up, s": WARM_UP_S,
-            "seed": options.seed,
-            "TCP of Zenoh": options.tcp_control,
+            "seed": SEED,
+            "TCP of Zenoh": TCP_CONTROL,
             "FIFO up, B": [link.up.fifo_bytes for link in links],
-            "camera, B": [CAMERA_BYTES[camera_of(link, options.camera)] for link in links],
+            "camera, B": [CAMERA_BYTES[camera_of(link)] for link in links],
             "trouble": recorder.notes or "none",
         },
         keeps_rows=bool(options.only),
@@ -205,13 +204,8 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--rtt", nargs="+", type=float, help=f"ms, such as {RTTS_MS}")
     parser.add_argument("--loss", nargs="+", choices=list(LOSSES), help="of frames, %%; burst: 2 %% in runs of 8")
     parser.add_argument("--fifo", nargs="+", choices=FIFOS, help="depth of each queue")
-    parser.add_argument("--camera", choices=("auto", *CAMERA_BYTES), default="auto", help="raw from 50 Mbit/s on: auto")
     parser.add_argument(
         "--traces", type=Path, default=DATA / "uplinks", help="folder of recordings (default: %(default)s)"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="of the losses (default: %(default)s)")
-    parser.add_argument(
-        "--tcp-control", default="cubic", help="congestion control under Zenoh's TLS (default: %(default)s)"
     )
     parser.add_argument("--no-tcp", dest="tcp", action="store_false", help="no TCP flow: half the time")
     return parser

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from experiment import Finding, Report, command_line, run_experiment
-from pictures import Span, save_timeline
+from plot import Span, save_timeline
 from samples import Sample, p99
 from skeleton import Options
 
@@ -81,7 +81,7 @@ class _Roaming:
 
 def measure(options: Options) -> Report:
     """Let a robot roam among replicas that die."""
-    turns, chance = QUICK if options.quick else options.turns, random.Random(_SEED)
+    turns, chance = QUICK if options.quick else TURNS, random.Random(_SEED)
     sites = Sites(apart_s=APART_S, near_s=NEAR_S, size=SIZE)
     roaming, begun_s, before, place = _Roaming(sites), sites.now_s, sites.uplink_frames, 0
     for _ in range(turns):
@@ -120,6 +120,4 @@ def _samples(sites: Sites, begun_s: float) -> Sequence[Sample]:
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__)
-    parser.add_argument("--turns", type=int, default=TURNS, help="moves, and deaths (default: %(default)s)")
-    run_experiment(parser, measure, is_timed=False)
+    run_experiment(command_line(__doc__), measure, is_timed=False)

@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 from experiment import Report, Rows, command_line, run_experiment
 from machine import data_folder
+from plot import COLOURS, pyplot, save, tidy
 from skeleton import Options
 from spot_trace import Share, Trace, none_up, outages, pool_down, replica_down, share_with_interval
 
@@ -26,7 +27,7 @@ from fog.catalog.measured import measured
 from fog.plan.duration import duration_text, seconds_from_text
 
 RECOVERIES: Final = ("34s", "5min", "20min")
-BLOCK_S, RESAMPLES, MOST_REPLICAS = 6 * 3600.0, 2000, 3
+BLOCK_S, RESAMPLES, MOST_REPLICAS, SEED = 6 * 3600.0, 2000, 3, 1
 _HEAD: Final = ("way", "zones", "replicas", "recovery", "none up", "95 % interval", "if independent")
 WAYS: Final = {
     "stays": "each replica has a zone of its own and waits for it",
@@ -55,18 +56,17 @@ def main(words: Sequence[str] | None = None) -> None:
     """Compute the share of time in which no replica would have been up."""
     parser = command_line(__doc__)
     parser.add_argument("--recovery", action="append", help="from a preemption to a replacement; may be repeated")
-    parser.add_argument("--seed", type=int, default=1, help="of the resampling")
     run_experiment(parser, measure, words)
 
 
 def measure(options: Options) -> Report:
     """Replay every pool with every recovery time; ``--quick``: with the first one."""
-    traces, chance = recorded(), np.random.default_rng(options.seed)
+    traces, chance = recorded(), np.random.default_rng(SEED)
     spans = [seconds_from_text(text) for text in options.recovery or RECOVERIES[: 1 if options.quick else None]]
     cases = [case for recovery_s in spans for case in replay(traces, recovery_s, chance)]
     return Report(
         "availability",
-        {"source": measured().source, "seed": options.seed, "cases": [asdict(case) for case in cases]},
+        {"source": measured().source, "seed": SEED, "cases": [asdict(case) for case in cases]},
         {"table": Rows(_HEAD, [_cells(case) for case in cases], words=2, numbers=5)},
         lambda path, _: _draw(path, cases),
         _figures(),
@@ -125,12 +125,10 @@ def _cells(case: Case) -> tuple[str, ...]:
 
 
 def _draw(path: Path, cases: Sequence[Case]) -> None:
-    from pictures import plt, save
-
-    figure, axes = plt.subplots(1, len(WAYS), figsize=(11, 3.8), layout="constrained")
+    figure, axes = pyplot().subplots(1, len(WAYS), figsize=(11, 3.8), layout="constrained")
     for axis, way in zip(axes, WAYS, strict=True):
         for at, recovery_s in enumerate(dict.fromkeys(case.recovery_s for case in cases)):
-            colour = ("#1f6f8b", "#e0902f", "#7a4f9a", "#5d6b75")[at % 4]
+            colour = COLOURS[1 + at % 4]
             mine = [case for case in cases if case.way == way and case.recovery_s == recovery_s]
             places = [case.replicas + (at - 1) * 0.12 for case in mine]
             shares = [case.none_up.share for case in mine]
@@ -145,15 +143,10 @@ def _draw(path: Path, cases: Sequence[Case]) -> None:
         axis.set_xlabel("replicas", fontsize=8)
         axis.yaxis.set_major_formatter(lambda share, _: f"{share:.0%}")
         axis.set_ylim(bottom=0)
-        axis.tick_params(labelsize=8)
-        axis.spines[["top", "right"]].set_visible(False)
+        tidy(axis, has_legend=way == list(WAYS)[-1])
     axes[0].set_ylabel("share of time with none up")
-    axes[-1].legend(fontsize=8, frameon=False)
-    figure.supxlabel(
-        "dots: replayed, with 95 % interval, one for each choice of zones; dashes: if zones were independent",
-        fontsize=8,
-    )
-    save(figure, path)
+    dots = "dots: replayed, with 95 % interval, one for each choice of zones; dashes: if zones were independent"
+    save(figure, path, footer=dots)
 
 
 if __name__ == "__main__":

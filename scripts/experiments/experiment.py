@@ -13,16 +13,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import yaml
 from bench_path import ROOT
 from field import REPLICA, Field, Served, Work
 from machine import MachineState, machine_state, require_trust, require_writable
-from page_text import text_of
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from skeleton import Options, add_allow_load, clean_exit
@@ -36,6 +37,9 @@ _COLUMNS: Final = ("", "requests", "failed", "mean, ms", "p50, ms", "p99, ms", "
 Panels = dict[str, dict[str, list[float]]]  # by panel and case
 _FIGURES: Final = ("figure", "here", "target", "", "paper")
 _LIST: Final = "\n\n- "  # begins the first list of a text
+_PAGES: Final = Path(__file__).with_name("pages")
+_WRAPPED: Final = re.compile(r"(?<!```bash)(?<=[^\n])\n(?!\n|\Z|- |#|```)\s*")
+PAPERS: Final[dict[str, Any]] = yaml.safe_load((_PAGES / "papers.yaml").read_text(encoding="utf-8"))  # their figures
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +122,7 @@ class Report:
     ) -> Report:
         """Return the report on latencies; ``groups``: samples by their label in the table."""
         rows = [
-            (label, str(found.count), str(found.failed), *(number_text(1e3 * each) for each in found.times_s))
+            (label, str(found.count), str(found.failed), *(number_text(1e3 * each) for each in astuple(found)[2:]))
             for label, found in ((label, Summary.of(samples)) for label, samples in groups.items())
         ]
         document = {
@@ -157,6 +161,12 @@ class Report:
             print_table(each.head, each.under(state), title=each.title, words=each.words)
         if self.settings or not self.tables:
             print(f"- {text.partition(_LIST)[2]}" if self.settings else text)
+
+
+def text_of(name: str, **figures: object) -> str:
+    """Return a text with its figures, in which each paragraph and each item of a list is one line."""
+    text = (_PAGES / f"{name}.md").read_text(encoding="utf-8").rstrip("\n")
+    return _WRAPPED.sub(" ", text).format(**figures)
 
 
 def title_of(text: str) -> str:

@@ -2,12 +2,10 @@
 
 sudo .venv/bin/python scripts/experiments/fig4.py                  # writes docs/experiments/fig4.*
 sudo .venv/bin/python scripts/experiments/fig4.py --quick          # few requests: does it work?
-sudo .venv/bin/python scripts/experiments/fig4.py --replicas 3
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Final
 
 from asking import Asking
@@ -20,6 +18,7 @@ from tag_cluster import SERVICE, TagCluster
 from fog_demo.cluster import DEDICATED, REPLICA
 
 REQUESTS, QUICK = 100, 10
+REPLICAS: Final = 2
 DIRECT: Final = "direct"
 FORMS: Final = {DIRECT: DEDICATED, "dedicated gateway": DEDICATED, "replica as gateway": REPLICA}
 COUNTED: Final = ("bytes a request from the robot", "bytes a request to the robot", "bytes a request at all replicas")
@@ -30,11 +29,15 @@ _EXTRA_SHARE: Final = 0.2  # accepted: a copy of its own to a replica that is to
 
 def measure(options: Options) -> Report:
     """Send the same requests in each form."""
-    count = QUICK if options.quick else options.requests
-    found = {form: _ask(form, options.replicas, count) for form in FORMS}
+    count = QUICK if options.quick else REQUESTS
+    found = {form: _ask(form, count) for form in FORMS}
     figures = {form: of for form, (_, of) in found.items()}
     findings = [Finding(f"{form}: {COUNTED[at]}", each) for form, of in figures.items() for at, each in enumerate(of)]
-    one, most = f"1/{options.replicas}", (1 + _EXTRA_SHARE) / options.replicas
+    panels = [
+        Panel(what, "kB a request", [Bar(form, of[at] / 1e3, ours=form != DIRECT) for form, of in figures.items()])
+        for at, what in enumerate(COUNTED)
+    ]
+    one, most = f"1/{REPLICAS}", (1 + _EXTRA_SHARE) / REPLICAS
     for form in list(FORMS)[1:]:
         share = figures[form][0] / figures[DIRECT][0]
         findings.append(Finding(f"{form}: share of direct, from the robot", share, most, True, one))
@@ -42,15 +45,15 @@ def measure(options: Options) -> Report:
         "fig4",
         {form: samples for form, (samples, _) in found.items()},
         findings,
-        {"replicas": options.replicas, "requests": count},
-        lambda path, title: save_bars(path, title, "", _panels(figures)),
+        {"replicas": REPLICAS, "requests": count},
+        lambda path, title: save_bars(path, title, "", panels),
     )
 
 
-def _ask(form: str, replicas: int, count: int) -> tuple[list[Sample], list[float]]:
+def _ask(form: str, count: int) -> tuple[list[Sample], list[float]]:
     """Return the calls of a form, and its figures as in ``COUNTED``."""
-    services = tuple(f"{SERVICE}{number + 1}" for number in range(replicas)) if form == DIRECT else (SERVICE,)
-    with TagCluster(services, replicas // len(services), FORMS[form], _PATIENCE_S) as cluster:
+    services = tuple(f"{SERVICE}{number + 1}" for number in range(REPLICAS)) if form == DIRECT else (SERVICE,)
+    with TagCluster(services, REPLICAS // len(services), FORMS[form], _PATIENCE_S) as cluster:
         for number in (_WARM_UP, count):  # the first series sets up the paths
             before = cluster.received_bytes()
             series = Series("tag", services, number * len(services), (), _PATIENCE_S, warm_up=_WARM_UP * len(services))
@@ -60,15 +63,5 @@ def _ask(form: str, replicas: int, count: int) -> tuple[list[Sample], list[float
     return samples, [(now - then) / (count + _WARM_UP) for then, now in zip(before, after, strict=True)]
 
 
-def _panels(figures: Mapping[str, Sequence[float]]) -> list[Panel]:
-    return [
-        Panel(what, "kB a request", [Bar(form, of[at] / 1e3, ours=form != DIRECT) for form, of in figures.items()])
-        for at, what in enumerate(COUNTED)
-    ]
-
-
 if __name__ == "__main__":
-    parser = command_line(__doc__)
-    parser.add_argument("--requests", type=int, default=REQUESTS, help="of each form (default: %(default)s)")
-    parser.add_argument("--replicas", type=int, choices=range(2, 9), default=2, help="(default: %(default)s)")
-    run_experiment(parser, measure)
+    run_experiment(command_line(__doc__), measure)

@@ -3,7 +3,6 @@
     sudo .venv/bin/python scripts/experiments/fig5.py                  # writes docs/experiments/fig5.*
     sudo .venv/bin/python scripts/experiments/fig5.py --quick          # a few seconds: does it work?
     sudo .venv/bin/python scripts/experiments/fig5.py --no-planning    # only the servers that wait: 4 minutes
-    sudo .venv/bin/python scripts/experiments/fig5.py --trials 100 --timeout 100    # computed as in the paper: hours
 
 Two planners that share a machine's cores do not show the effect of two machines. So there are also servers that wait
 as long as a recorded run took, and compute nothing. The time of each request is then known before, and the result can
@@ -22,7 +21,7 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Field, Served, Work
 from machine import DATA, RefusedError, data_folder
-from pictures import save_distributions
+from plot import save_distributions
 from recorded import FASTER, LIMIT_S, draw, load
 from samples import Sample, Series, least_of_two, p99
 from skeleton import Options
@@ -51,8 +50,7 @@ _PAPER: Final = {  # mean gain, p99 gain
 
 def measure(options: Options) -> Report:
     """Plan motions with one server and with two replicas."""
-    counts = {each: options.trials or count for each, count in TRIALS.items()}
-    waits, timeout = options.waits, options.timeout
+    counts, waits, timeout = dict(TRIALS), options.waits, TIMEOUT_S
     if options.quick:
         counts, waits = {QUICK[0]: QUICK[1]}, min(waits, QUICK[2])
     counts = counts if options.planning else {}
@@ -178,8 +176,6 @@ def _figures(counts: Mapping[str, int], timeout_s: float) -> dict[str, object]:
 
 if __name__ == "__main__":
     parser = command_line(__doc__)
-    parser.add_argument("--trials", type=int, default=0, help="of each problem; 0: a number that a person waits for")
-    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds of a planner (default: %(default)s)")
     parser.add_argument("--waits", type=int, default=_WAITS, help="trials of each wait; 0: none (default: %(default)s)")
     parser.add_argument("--planning", action=argparse.BooleanOptionalAction, default=True, help="plan, or only wait")
     run_experiment(parser, measure)

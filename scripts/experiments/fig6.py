@@ -17,11 +17,11 @@ from asking import Asking
 from experiment import CASES, Finding, Report, command_line, field_of, gains, latencies_of, run_experiment, work_of
 from field import Served
 from frames import TYPE
-from pictures import save_distributions
+from plot import save_distributions
 from recorded import draw, segmentation_runs
 from samples import Sample, Series, least_of_two, p99
 from skeleton import Options
-from vision import require_networks
+from vision import require_network
 
 REQUESTS: Final = 300
 COMPUTED: Final = 100
@@ -58,10 +58,10 @@ _SETTINGS: Final = {
 
 def measure(options: Options) -> Report:
     """Segment frames while a second client contends for one replica."""
-    wanted = {_WAIT: options.requests, _COMPUTE: options.computed}
+    wanted = {_WAIT: REQUESTS, _COMPUTE: options.computed}
     wanted = {_WAIT: QUICK, _COMPUTE: QUICK * options.compute} if options.quick else wanted
     if wanted[_COMPUTE]:
-        require_networks("let no servers compute: --computed 0")
+        require_network()
     chosen = [what for what, each in _SETTINGS.items() if each.is_contended or not options.quick]
     counts = {what: count for what in chosen if (count := wanted[_SETTINGS[what].role])}
     served = [Served(_TWO, TYPE, _MACHINES), Served(_ONE, TYPE, _MACHINES[:1])]
@@ -98,7 +98,6 @@ def _times() -> dict[str, list[float]]:
 
 if __name__ == "__main__":
     parser = command_line(__doc__)
-    parser.add_argument("--requests", type=int, default=REQUESTS, help="while servers wait (default: %(default)s)")
     parser.add_argument("--computed", type=int, default=COMPUTED, help="while they compute (default: %(default)s)")
     parser.add_argument("--compute", action="store_true", help="with --quick: let servers compute, too")
     run_experiment(parser, measure)

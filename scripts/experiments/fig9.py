@@ -2,7 +2,7 @@
 
 sudo .venv/bin/python scripts/experiments/fig9.py                  # writes docs/experiments/fig9.*
 sudo .venv/bin/python scripts/experiments/fig9.py --quick          # a few seconds: does it work?
-sudo .venv/bin/python scripts/experiments/fig9.py --minutes 30 --machines 3
+sudo .venv/bin/python scripts/experiments/fig9.py --minutes 30
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 
 from asking import Asking
 from experiment import Finding, Report, command_line, run_experiment
-from pictures import Span, save_timeline
+from plot import Span, save_timeline
 from report import progress
 from samples import Sample, Series, Summary
 from skeleton import Options
@@ -23,6 +23,7 @@ from tag_cluster import SERVICE, TagCluster
 from fog_demo.cluster import DEDICATED
 
 MINUTES: Final = 2.0
+MACHINES: Final = 2
 QUICK_MINUTES: Final = 0.25
 _HZ: Final = 10.0
 _STEADY_S: Final = 4.0  # time in which all serve, before the next machine is killed
@@ -65,7 +66,7 @@ def measure(options: Options) -> Report:
         "tag", (SERVICE,), count, (), _PATIENCE_S, lanes=_LANES, gap_s=1 / _HZ, warm_up=10, counts_answers=True
     )
     samples: list[Sample] = []
-    with TagCluster([SERVICE], options.machines, DEDICATED, _PATIENCE_S) as cluster, Asking(cluster, series) as asking:
+    with TagCluster([SERVICE], MACHINES, DEDICATED, _PATIENCE_S) as cluster, Asking(cluster, series) as asking:
         fault_injector = _FaultInjector(cluster)
         for sample in asking:
             samples.append(sample)
@@ -78,7 +79,7 @@ def measure(options: Options) -> Report:
         "fig9",
         _groups(samples, spans, from_s),
         _findings(samples, asking, spans),
-        {"machines": options.machines, "requests a second": _HZ, "kills": len(spans)},
+        {"machines": MACHINES, "requests a second": _HZ, "kills": len(spans)},
         lambda path, title: save_timeline(path, title, drawn, spans, from_s),
         {"steady_s": _STEADY_S},
     )
@@ -112,5 +113,4 @@ def _findings(samples: list[Sample], asking: Asking, spans: list[Span]) -> list[
 if __name__ == "__main__":
     parser = command_line(__doc__)
     parser.add_argument("--minutes", type=float, default=MINUTES, help="how long (default: %(default)s)")
-    parser.add_argument("--machines", type=int, choices=range(2, 9), default=2, help="(default: %(default)s)")
     run_experiment(parser, measure)

@@ -1,7 +1,7 @@
 """Tasks with a grey frame: what a robot asks, what a server answers, and whether the answer is right.
 
 Sans-I/O, but the server of ``count`` waits. Each task has both halves: ``FRAME_TASKS`` names them. The frames are drawn
-once, when a client makes a task; the networks are loaded when a server does.
+once, when a client makes a task; the network is loaded when a server does.
 
 The installed packages have no service that takes an image, so ``rcl_interfaces/srv/SetParameters`` carries it. The
 request has one parameter, named by the frame's number. Its integer array holds the 640 x 480 bytes of the frame, eight
@@ -23,7 +23,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
 from rcl_interfaces.srv import SetParameters
-from vision import SHAPE, Grey, Mask, Networks, Scene, count_words
+from vision import SHAPE, Grey, Mask, Network, Scene, count_words
 
 Said: TypeAlias = "Mapping[str, Any]"  # content of an answer
 See: TypeAlias = "Callable[[Grey], Said]"
@@ -91,14 +91,9 @@ def _of_scenes(is_right: Callable[[Said, Scene], bool], see_with: Callable[[Said
     )
 
 
-def _detect(_: Said) -> See:
-    networks = Networks()
-    return lambda frame: {"found": networks.detect(frame)}
-
-
 def _segment(_: Said) -> See:
-    networks = Networks()
-    return lambda frame: {"mask": text_of(networks.segment(frame))}
+    network = Network()
+    return lambda frame: {"mask": text_of(network.segment(frame))}
 
 
 def _count(settings: Said) -> See:
@@ -143,7 +138,6 @@ def _find_tag(_: Said) -> See:
 
 
 FRAME_TASKS: Final[Mapping[str, FrameTask]] = {
-    "detect": _of_scenes(lambda said, scene: scene.agrees(said["found"]), _detect),
     "segment": _of_scenes(lambda said, scene: scene.is_covered(mask_in(said["mask"])), _segment),
     "count": _of_scenes(lambda said, scene: said["words"] == len(scene.words), _count),
     "tag": FrameTask(_draw_tags, _judge_pose, _find_tag),

@@ -2,7 +2,6 @@
 
     sudo .venv/bin/python scripts/experiments/offload.py               # all; writes docs/experiments/offload.*
     sudo .venv/bin/python scripts/experiments/offload.py --quick       # a few seconds: does it work?
-    sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM       # a piece; the rest is kept
 
 Robot and server are nodes of ROS 2 on the first and the last machine of the ring, with its three trust domains. The
 unsecured ROS 2 takes as many links over Linux bridges (``scripts/bench/ros_row.py``). ``offload_tasks.py`` describes
@@ -22,7 +21,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Final
 
 from bench_path import ROOT
-from experiment import OUTPUT, Report, command_line, run_experiment
+from experiment import Report, command_line, run_experiment
 from machine import machine_state
 from offload_page import CDR, CYCLONE, FAST, JSON, figures_of, panels_of
 from plot import save_bars
@@ -31,7 +30,6 @@ from ros_row import DIRECT_DOMAIN, READY_S, Row
 from skeleton import Options
 
 from gdp.host.cgroups import Cgroup
-from lab.cores import CORES_HELP, cores_of
 from lab.credentials import Carried
 from lab.process import LabProcess, new_run
 from lab.topology import LEFT, RIGHT, ring5
@@ -74,17 +72,14 @@ def measure(options: Options) -> Report:
     from offload_tasks import TASKS
 
     quick: bool = options.quick
-    names = [_QUICK] if quick else options.task or list(COMPUTED)
+    names = [_QUICK] if quick else list(COMPUTED)
     for name in names:
         TASKS[name]()  # so that missing data are reported first
-    held = (options.out or OUTPUT) / "offload.json"
-    tasks: dict[str, dict[str, object]] = {}
-    if held.exists() and not quick:
-        tasks = json.loads(held.read_text(encoding="utf-8"))["tasks"]
+    tasks = {}
     for name in names:
         machine = {"machine": asdict(machine_state())}
         tasks[name] = {
-            "network": _network(name, 1 if quick else options.rounds, quick=quick, is_limited=options.cores) | machine,
+            "network": _network(name, 1 if quick else ROUNDS, quick=quick) | machine,
             "alone": _alone(name, quick=quick) | machine,
         }
     document = {"slower": SLOWER, "tasks": tasks}
@@ -98,7 +93,7 @@ def measure(options: Options) -> Report:
     )
 
 
-def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[str, object]:
+def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
     """Let every contender carry a task, in turn, round by round."""
     from offload_tasks import TASKS
 
@@ -115,9 +110,7 @@ def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[s
     at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
     found = {who: Measured() for who in CONTENDERS}
     size = 0
-    ring = ring5(MTU)
-    cores = cores_of(ring) if is_limited else None
-    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True, ring=ring, cores=cores) as row:
+    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True, ring=ring5(MTU)) as row:
         for at in range(1, rounds + 1):
             for who, middleware in CONTENDERS.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
@@ -127,7 +120,6 @@ def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[s
                 size = _trip(row, found[who], orders, at_once, direct=who not in ENCODINGS)
     return {
         "over": "the ring of three domains",
-        "cores": cores,
         "request_bytes": size,
         "rounds": rounds,
         "answered_at_once": rounds * at_once,
@@ -194,8 +186,4 @@ def _short(value: object) -> object:
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__)
-    parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
-    parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
-    parser.add_argument("--cores", action="store_true", help=CORES_HELP)
-    run_experiment(parser, measure)
+    run_experiment(command_line(__doc__), measure)

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from experiment import PAPERS
 from machine import MachineState
-from page_text import PAPERS
 from plot import Bar, Panel
 from report import markdown_table, percentile
 
@@ -128,14 +128,9 @@ def _details(networks: Document) -> str:
 def _trials(name: str, network: Document) -> str:
     return (
         f"{name}: {network['rounds']} rounds, {network['answered_at_once']} requests answered at once (there, back) and"
-        f" {network['computed']} computed (computed, total), the overlay over {network['over']}, {_cores_text(network)}"
+        f" {network['computed']} computed (computed, total), the overlay over {network['over']}, machines share all"
+        " cores"
     )
-
-
-def _cores_text(network: Document) -> str:
-    if network["cores"] is None:
-        return "machines share all cores"
-    return "cores by control groups: " + ", ".join(f"{node} {count}" for node, count in network["cores"].items())
 
 
 def share_text(cores: float) -> str:

@@ -152,7 +152,7 @@ class MotionPlanning:
 
     def compute(self, messages: Sequence[Message]) -> Message:
         """Return the path, seven numbers a state; empty: none was found in time."""
-        way = self._problem(messages).solve(_PLANNER, _PLANNING_LIMIT_S, lambda: False).way or []
+        way = self._problem(messages).solve(_PLANNER, _PLANNING_LIMIT_S, lambda: False)
         return Float64MultiArray(data=array.array("d", [number for place in way for number in place]))
 
     def is_right(self, number: int, answer: Message) -> bool:

@@ -18,7 +18,7 @@ from typing import Final
 from asking import Asking
 from experiment import Finding, Report, command_line, field_of, run_experiment, work_of
 from field import Field, Served
-from pictures import Span, save_timeline
+from plot import Span, save_timeline
 from samples import Sample, Series
 from skeleton import Options
 
@@ -62,7 +62,7 @@ class _Stopper:
 
 def measure(options: Options) -> Report:
     """Call a service on one machine and one on two, while machines stop and continue."""
-    seconds = QUICK_S if options.quick else options.seconds
+    seconds = QUICK_S if options.quick else SECONDS
     drawn = [span for each in _MACHINES for span in draw_outages(random.Random(f"{_SEED} {each}"), seconds, each)]
     served = [Served(_TWO, _TYPE, _MACHINES), Served(_ONE, _TYPE, _MACHINES[:1])]
     work = work_of(served, "replay", {each: {"waits_s": {}} for each in _MACHINES})
@@ -135,6 +135,4 @@ def _findings(
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__)
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="how long (default: %(default)s)")
-    run_experiment(parser, measure)
+    run_experiment(command_line(__doc__), measure)

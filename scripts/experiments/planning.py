@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import configparser
 import io
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 
 import fcl
 import numpy as np
@@ -28,17 +27,6 @@ _AXES: Final = "xyz"
 Mesh: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.int64]]"
 Place: TypeAlias = "tuple[float, ...]"
 Way: TypeAlias = "list[Place]"
-
-
-class Solved(NamedTuple):
-    """Outcome of one run.
-
-    ``way``: poses, each with a position and a quaternion (w last); None: not found in time. ``checks``: states whose
-    validity was checked; this measure of work does not depend on other load of the machine.
-    """
-
-    way: Way | None
-    checks: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +56,13 @@ class Problem:
         vertices, faces = _mesh(robot)
         return cls((vertices - vertices.mean(axis=0), faces), _mesh(world), start, goal, low, high)
 
-    def solve(
-        self, planner: str, patience_s: float, is_over: Callable[[], bool], most_checks: float = math.inf
-    ) -> Solved:
-        """Search for a path.
+    def solve(self, planner: str, patience_s: float, is_over: Callable[[], bool]) -> Way:
+        """Return a path: poses, each with a position and a quaternion (w last); empty: none was found in time.
 
         Args:
             planner: its class in ``ompl.geometric``, such as ``RRTConnect``.
             patience_s: limit of the search, in seconds.
             is_over: polled during the search; whether the path is no longer wanted.
-            most_checks: limit of the search, in states, whatever the load; a path that took as many counts as none.
         """
         space = base.SE3StateSpace()
         bounds = base.RealVectorBounds(3)
@@ -86,8 +71,7 @@ class Problem:
             bounds.setHigh(axis, self.high[axis])
         space.setBounds(bounds)
         setup = geometric.SimpleSetup(space)
-        checks = [0]
-        setup.setStateValidityChecker(self._checker(checks))
+        setup.setStateValidityChecker(self._checker())
         ends = []
         for place in (self.start, self.goal):
             state = space.allocState()
@@ -97,20 +81,18 @@ class Problem:
         setup.setStartAndGoalStates(*ends)
         setup.setPlanner(getattr(geometric, planner)(setup.getSpaceInformation()))
         timed = base.timedPlannerTerminationCondition(patience_s)
-        stopped = base.PlannerTerminationCondition(lambda: checks[0] >= most_checks or is_over())
+        stopped = base.PlannerTerminationCondition(is_over)
         setup.solve(base.plannerOrTerminationCondition(timed, stopped))
-        if checks[0] >= most_checks or not setup.haveExactSolutionPath():
-            return Solved(None, checks[0])
+        if not setup.haveExactSolutionPath():
+            return []
         states = setup.getSolutionPath().getStates()
-        way = [(each.getX(), each.getY(), each.getZ(), *_turn(each.rotation())) for each in states]
-        return Solved(way, checks[0])
+        return [(each.getX(), each.getY(), each.getZ(), *_turn(each.rotation())) for each in states]
 
-    def _checker(self, checks: list[int]) -> Callable[[base.State], bool]:
+    def _checker(self) -> Callable[[base.State], bool]:
         robot, world = (fcl.CollisionObject(_volume(mesh), fcl.Transform()) for mesh in (self.robot, self.world))
         request, low, high = fcl.CollisionRequest(), self.low, self.high
 
         def is_free(state: base.State) -> bool:
-            checks[0] += 1
             at, turn = (state.getX(), state.getY(), state.getZ()), state.rotation()
             if not all(a <= x <= b for a, x, b in zip(low, at, high, strict=True)):
                 return False

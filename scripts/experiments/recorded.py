@@ -1,9 +1,9 @@
 """Waits of servers that compute nothing, drawn from recorded runs of planners and of a network.
 
-Sans-I/O, but for reading the recordings. ``record.py`` writes the number of states that each run checked, by problem,
-with the planner's name. The number is proportional to the time of the run on an idle machine. A run that had no path
-after ``MOST_CHECKS`` was stopped there, and counts as the paper's timeout. Of a run of DBNet there is the processor
-time.
+Sans-I/O, but for reading the recordings. Of a run of a planner there is the number of states that it checked, by
+problem, with the planner's name. The number is proportional to the time of the run on an idle machine. A run that had
+no path after ``MOST_CHECKS`` was stopped there, and counts as the paper's timeout. Of a run of DBNet there is the
+processor time. ``git show 55cf6b3c:scripts/experiments/record.py`` is the program that recorded them.
 """
 
 from __future__ import annotations

@@ -80,8 +80,7 @@ def _plan(settings: Settings) -> Way:
         problem = problems.get(request.start.header.frame_id)
         if problem is None:
             return []
-        found = problem.solve(settings["planner"], settings["patience_s"], flag.is_set)
-        return [_stamped(*each) for each in found.way or []]
+        return [_stamped(*each) for each in problem.solve(settings["planner"], settings["patience_s"], flag.is_set)]
 
     return way
 

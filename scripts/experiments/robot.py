@@ -21,7 +21,7 @@ from rclpy.task import Future
 from ros_endpoint import End, Settings, reliable, run_role
 from samples import Sample, Series
 from service_msgs.msg import ServiceEventInfo
-from tasks import TASKS, WARM_UP, Response, Task
+from tasks import WARM_UP, Response, Task, task_of
 
 _PATIENCE_S: Final = 30.0
 _TICK_S: Final = 0.002
@@ -116,7 +116,7 @@ class _Client:
 def ask(end: End, settings: Settings) -> None:
     """Call so often, and print what came of each call, in a line of its own."""
     series = Series(**settings)
-    client = _Client(end.node, TASKS[series.task](series.problem), series.services)
+    client = _Client(end.node, task_of(series.task, series.problem), series.services)
     answers = client.count_answers() if series.counts_answers else None
     client.wait_for_servers()
     deadline_s = time.monotonic() + _PATIENCE_S
@@ -154,7 +154,7 @@ def ask(end: End, settings: Settings) -> None:
 def busy(end: End, settings: Settings) -> None:
     """Call one service, one call after the other for ``on_s``, none for ``off_s``, and so on, until killed."""
     on_s, off_s = settings["on_s"], settings["off_s"]
-    client = _Client(end.node, TASKS[settings["task"]](""), [settings["service"]])
+    client = _Client(end.node, task_of(settings["task"]), [settings["service"]])
     client.wait_for_servers()
     begun_s = time.monotonic()
     say(event="begins", at_s=begun_s)

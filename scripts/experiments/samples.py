@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import fmean
 
 import bench_path  # noqa: F401 - finds ``report``
 from report import percentile
+
+p99 = partial(percentile, share=0.99)  # of fewer than a hundred values the largest
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +22,7 @@ class Series:
     """Calls of several services in turn; each round of them carries the same request.
 
     Args:
-        task: a kind of request in ``tasks.TASKS``.
+        task: a kind of request in ``tasks.task_of``.
         count: of calls in all.
         machines: each has answered a call before the series begins.
         patience_s: after which a call has failed.
@@ -76,11 +79,6 @@ class Summary:
     p99_s: float
     worst_s: float
 
-    @property
-    def times_s(self) -> tuple[float, ...]:
-        """Return mean, median, 99th percentile and the worst."""
-        return self.mean_s, self.p50_s, self.p99_s, self.worst_s
-
     @classmethod
     def of(cls, samples: Sequence[Sample]) -> Summary:
         """Return the summary of one request or more; failed ones count with the time that they cost.
@@ -90,14 +88,6 @@ class Summary:
         times = [each.latency_s for each in samples]
         failed = sum(not each.is_right for each in samples)
         return cls(len(times), failed, fmean(times), percentile(times, 0.5), p99(times), max(times))
-
-
-def p99(values: Sequence[float]) -> float:
-    """Return the 99th percentile; of fewer than a hundred values it is the largest.
-
-    Raises ``ValueError``: no values.
-    """
-    return percentile(values, 0.99)
 
 
 def least_of_two(values: Sequence[float]) -> list[float]:

@@ -5,9 +5,7 @@ Sans-I/O. Only a task with frames loads the libraries that draw them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Final, TypeAlias
 
 from nav_msgs.srv import GetPlan
@@ -59,9 +57,6 @@ class Number:
 
     kind = ListParameters
 
-    def __init__(self, problem: str) -> None:
-        del problem
-
     def request(self, number: int) -> Request:
         """Return the request with this number."""
         return ListParameters.Request(prefixes=[_FILL], depth=max(number, 0))
@@ -77,10 +72,9 @@ class Look:
 
     kind = SetParameters
 
-    def __init__(self, name: str, problem: str) -> None:
+    def __init__(self, name: str) -> None:
         from frames import FRAME_TASKS
 
-        del problem
         self._task = FRAME_TASKS[name]
         self._drawn = self._task.draw()
 
@@ -102,8 +96,7 @@ class Look:
 
 Task: TypeAlias = "Plan | Number | Look"
 
-TASKS: Final[Mapping[str, Callable[[str], Task]]] = {
-    "plan": Plan,
-    "number": Number,
-    **{name: partial(Look, name) for name in ("detect", "segment", "count", "tag")},
-}
+
+def task_of(kind: str, problem: str = "") -> Task:
+    """Return a task: ``plan``, with its problem, ``number``, or one with frames."""
+    return Plan(problem) if kind == "plan" else Number() if kind == "number" else Look(kind)

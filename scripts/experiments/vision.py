@@ -1,7 +1,7 @@
-"""Frames with words, and neural networks that find and read them: the load of figures 6 and 7.
+"""Frames with words, and a neural network that finds them: the load of figures 6 and 7.
 
-Sans-I/O, but for loading the networks, which the wheel ``rapidocr-onnxruntime`` (Apache-2.0) has: DBNet gives each
-pixel the probability that it is text, and a recogniser reads a line. The frames are drawn here: answers can be checked.
+Sans-I/O, but for loading the network, which the wheel ``rapidocr-onnxruntime`` (Apache-2.0) has: DBNet gives each
+pixel the probability that it is text. The frames are drawn here: answers can be checked.
 Source: Liao et al., "Real-time Scene Text Detection with Differentiable Binarization" (AAAI 2020).
 """
 
@@ -31,7 +31,6 @@ _BLOCK: Final = 8  # pixels; between the gaps in a word and those between words
 _OVERLAP: Final = 0.5  # least intersection over union of an answer and what was drawn, as in PASCAL VOC
 _WHEEL: Final = "rapidocr_onnxruntime"
 _PIXEL, _SIDE_PX = 0.3, 3  # least probability of a pixel, and least side of a region
-_UNCLIP: Final = 0.9  # the wheel's 1.6 gives boxes with a wider margin
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,22 +59,14 @@ class Scene:
         noisy = np.asarray(image) + random.normal(0.0, _NOISE, SHAPE)
         return cls(np.clip(noisy, 0, 255).astype(np.uint8), tuple(words))
 
-    def agrees(self, found: object) -> bool:
-        """Return whether ``found``, as of ``detect``, is exactly the words, each read right and in its place."""
-        places = [(text, _mask_of(box)) for text, box in found] if isinstance(found, list) else []
-        return len(places) == len(self.words) and all(
-            any(text == word and _overlap(_mask_of(box), place) >= _OVERLAP for text, place in places)
-            for word, box in self.words
-        )
-
     def is_covered(self, mask: Mask) -> bool:
         """Return whether a mask has a region for each word, and covers the words."""
         drawn = _mask_of(*(box for _, box in self.words))
         return int(ndimage.label(mask)[1]) == len(self.words) and _overlap(mask, drawn) >= _OVERLAP
 
 
-class Networks:
-    """DBNet and the recogniser, on one thread (about 70 ms a frame, and 10 ms more a word)."""
+class Network:
+    """DBNet, on one thread (about 70 ms a frame)."""
 
     def __init__(self) -> None:
         from rapidocr_onnxruntime import RapidOCR
@@ -89,21 +80,12 @@ class Networks:
         (chance,) = self._reader.text_det.infer(channels)[0][0]
         return np.asarray(ndimage.binary_opening(chance > _PIXEL, np.ones((_SIDE_PX, _SIDE_PX))))
 
-    def detect(self, frame: Grey) -> list[tuple[str, Box]]:
-        """Return the text and the box of each line."""
-        lines, _ = self._reader(frame, use_cls=False, unclip_ratio=_UNCLIP)
-        corners = [(text, np.array(four, dtype=int)) for four, text, _ in lines or ()]
-        return [(text, (*four.min(axis=0)[::-1].tolist(), *four.max(axis=0)[::-1].tolist())) for text, four in corners]
 
-
-def require_networks(instead: str) -> None:
-    """Refuse to compute without the networks; ``instead`` is what else to do.
-
-    Raises ``RefusedError``: they are not installed.
-    """
+def require_network() -> None:
+    """Refuse to compute without the network. Raises ``RefusedError``: it is not installed."""
     if find_spec(_WHEEL) is None:
         what = f"{_WHEEL} is not installed: pip install 'gdp-ros[experiments]' (Python 3.10 to 3.12)"
-        raise RefusedError(f"{what}, or {instead}")
+        raise RefusedError(f"{what}, or let no servers compute: --computed 0")
 
 
 def count_words(frame: Grey) -> int:

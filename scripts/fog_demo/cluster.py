@@ -1,6 +1,6 @@
 """Cluster of ``fog`` with the provider ``local``: machines that serve, a robot, and a node there that calls.
 
-I/O. The demonstration, ``recovery.py`` and figures 4 and 9 run on it. Resources of ``fog`` outlive this process, like
+I/O. The demonstration and figures 4 and 9 run on it. Resources of ``fog`` outlive this process, like
 machines of a cloud. A run therefore ends with ``fog down``, and records lead to the leftovers of a killed run. The
 records are in a separate folder, which no other program sweeps.
 """
@@ -11,7 +11,6 @@ import os
 import signal
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -19,7 +18,6 @@ from typing import Final, TypeVar
 
 from fog.providers.local import fault_injection
 from fog.site import open_site
-from fog.supervisor.background import pid_of
 from fog.supervisor.core.record import Record
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Entry, Journal
@@ -28,10 +26,9 @@ from gdp.host.run_registry import Run, RunRegistry, outer_uid
 from lab.dds import ros_environment
 from lab.machine import LabMachine
 from lab.namespaces import Namespaces
-from lab.process import Event, FailedError, LabProcess, UndoneOnExit, until
+from lab.process import Event, LabProcess, UndoneOnExit, until
 from lab.topology import single
 
-ECHO: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
 DEDICATED, REPLICA = "dedicated", "replica"
 ROBOT: Final = "robot"
 STATE: Final = "state"
@@ -87,7 +84,7 @@ class Cluster(UndoneOnExit):
 
     Args:
         launch_files: their texts; each has one ``FogCluster``.
-        machines: how many; more than the launch files have only where there is one.
+        machines: how many they have.
         gateway: ``DEDICATED`` or ``REPLICA``.
         kind: of the run's records.
         note: shows progress.
@@ -109,7 +106,6 @@ class Cluster(UndoneOnExit):
         kind: str = "bench",
         note: Callable[[str], object] = _note,
     ) -> None:
-        self.gateway = gateway
         self.meanwhile: Callable[[], object] | None = None
         self._note = note
         self._machines_wanted = machines
@@ -129,11 +125,8 @@ class Cluster(UndoneOnExit):
                 self._fog("launch", str(path), "--detach", "--gateway", gateway)
             self._site = open_site(None, self._run.directory / STATE)
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
-            if (missing := machines - len(self.machines())) > 0:
-                self._fog("scale", "up", str(missing))
             self._until(lambda: all(each.is_serving for each in self.machines()), "all machines that serve")
             self._runs = local_provider(self._site).runs
-            self._supervisors = undo.enter_context(ExitStack())
             self._undo = undo.pop_all()
 
     def call(self, rate_hz: float) -> None:
@@ -153,25 +146,6 @@ class Cluster(UndoneOnExit):
         serving = [each for each in self.machines() if each.is_serving]
         return min(serving, key=lambda each: each.served_unix_s or 0.0)
 
-    def gateway_machine(self) -> Record:
-        """Return the machine that is the gateway."""
-        return self._until(lambda: next((each for each in self.machines() if each.gateway), None), "a gateway")
-
-    def longest_silence(self, after_s: float) -> float:
-        """Return the longest time without an answer from this moment until now, in seconds."""
-        now_s, longest_ms = time.time(), 0.0
-        while True:
-            said = self._caller.read(_PATIENCE_S)
-            unix_s = said["unix_s"]
-            if unix_s >= after_s:
-                longest_ms = max(longest_ms, said["silence_ms"])
-            if unix_s >= now_s:
-                return longest_ms / 1e3
-
-    def freeze(self, machine: Record) -> None:
-        """Stop all processes of a machine (SIGSTOP)."""
-        fault_injection.freeze(self._runs, machine.id)
-
     def notice(self, machine: Record, seconds: float) -> None:
         """Send a machine its preemption notice."""
         fault_injection.notice(self._runs, machine.id, seconds)
@@ -179,21 +153,6 @@ class Cluster(UndoneOnExit):
     def kill(self, machine: Record) -> None:
         """Kill all processes of a machine, and unplug it."""
         fault_injection.kill(self._runs, machine.id)
-
-    def kill_supervisor(self) -> None:
-        """Kill the supervisor; return when it is gone."""
-        pid = pid_of(self._site)
-        if pid is None:
-            raise FailedError("no supervisor lives")
-        os.kill(pid, signal.SIGKILL)
-        self._until(lambda: pid_of(self._site) is None, "the supervisor's end")
-
-    def start_supervisor(self) -> float:
-        """Start a supervisor; return the time, in seconds since 1970."""
-        self._supervisors.close()
-        at_s = time.time()
-        self._supervisors.enter_context(self.start("supervisor", _fog_command(self._run, ["supervise"])))
-        return at_s
 
     def machines(self, *, gone: bool = False) -> list[Record]:
         """Return all machines; ``gone``: those that are gone, too."""
@@ -212,14 +171,14 @@ class Cluster(UndoneOnExit):
         """Return the replacement when it serves."""
         return self._until(lambda: self.replacement(after_s), "a replacement that serves")
 
-    def await_event(self, machine: str | None, what: set[str], after_s: float) -> float:
-        """Return when one of these events was recorded of a machine, or of any, in seconds since 1970."""
+    def await_event(self, machine: str, what: set[str], after_s: float) -> float:
+        """Return when one of these events was recorded of a machine, in seconds since 1970."""
 
         def written() -> float | None:
-            found = (e for e in self._journal.events() if machine in (None, e.machine) and e.what in what)
-            return next((each.unix_s for each in found if each.unix_s >= after_s), None)
+            found = (e.unix_s for e in self._journal.events() if e.machine == machine and e.what in what)
+            return next((unix_s for unix_s in found if unix_s >= after_s), None)
 
-        return self._until(written, f"{machine or 'any machine'}: {' or '.join(sorted(what))}")
+        return self._until(written, f"{machine}: {' or '.join(sorted(what))}")
 
     def await_whole(self, victim: Record) -> None:
         """Return when this machine is gone and the wanted number of other machines serve."""

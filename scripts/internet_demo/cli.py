@@ -6,11 +6,9 @@ I/O. Exit status: 0 nothing lost, 1 something lost, 2 wrong input, 130 and 143 f
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Annotated, Final
 
 import typer
@@ -18,11 +16,12 @@ from rich.console import Console
 
 from gdp.errors import LocalError
 from gdp.host.interruption import let_nothing_interrupt
-from gdp.host.run_registry import RunRegistry, outer_uid
+from gdp.host.run_registry import RunRegistry
 from internet_demo.figure1 import run_figure1
 from internet_demo.scenario import Display, Outcome, Pace, run_scenario
 from lab.command import console_of, end_on_signals, exit_with, new_app, tell
 from lab.internet.laboratory import TOOLS, Laboratory
+from lab.process import new_run
 
 _PACE: Final = Pace()
 
@@ -40,7 +39,6 @@ app = new_app()
 @app.command(epilog=_EXAMPLES)
 def demo(
     rate: Annotated[float, typer.Option(min=1, max=200, help="Images, and calls, a second.")] = _PACE.rate_hz,
-    size: Annotated[int, typer.Option(min=100, max=1_000_000, help="Bytes of an image.")] = _PACE.image_bytes,
     calm: Annotated[float, typer.Option(min=0.5, help="Seconds after each event.")] = _PACE.calm_s,
     delay: Annotated[float, typer.Option(min=0, max=500, help="Delay of each uplink, in ms.")] = _PACE.delay_ms,
     figure1: Annotated[bool, typer.Option("--figure1", help="Figure 1 of FogROS G: ROS 2 drone, ROS 1 cloud.")] = False,
@@ -52,7 +50,7 @@ def demo(
     images and calls cross. It takes about a minute; the last line says how many of them were lost. Everything is gone
     afterwards, also after Ctrl-C; what a killed demonstration left, the next one removes.
     """
-    play, pace = run_figure1 if figure1 else run_scenario, Pace(rate, size, calm, delay)
+    play, pace = run_figure1 if figure1 else run_scenario, Pace(rate_hz=rate, calm_s=calm, delay_ms=delay)
     exit_with(partial(_run, play, pace, console_of(stderr=as_json), as_json))
 
 
@@ -64,17 +62,13 @@ def main() -> None:
 def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, console: Console, as_json: bool) -> int:
     if missing := [tool for tool in TOOLS if shutil.which(tool) is None]:
         raise LocalError(f"not installed: {', '.join(missing)} (packages iproute2, nftables, conntrack)")
-    runs = RunRegistry(Path(tempfile.gettempdir()) / f"gdp-internet-demo-{outer_uid()}")
-    for swept in runs.sweep():
+    for swept in RunRegistry().sweep():
         console.print(f"removed what run {swept} had left behind")
-    run = runs.start()
-    try:
-        end_on_signals()
+    end_on_signals()
+    with new_run() as run:
         with Laboratory(run) as laboratory, Display(console) as display:
             outcome = play(laboratory, pace, display)
-    finally:
         let_nothing_interrupt()
-        run.end()
     what = "images and commands" if outcome.drawing else f"images to two readers, {outcome.calls} calls"
     pauses = (f"longest pause {each.pause_s * 1e3:5.0f} ms: {each.text}" for each in outcome.events)
     return tell(

@@ -15,7 +15,6 @@ from lab.topology import Topology
 
 ROBOT_CORES: Final = 2
 EDGE_CORES: Final = 4
-CORES_HELP: Final = "Two cores' worth for the robot, four for each edge server, by cgroups."
 
 
 def cores_of(topology: Topology) -> dict[str, int]:

@@ -50,9 +50,9 @@ class SharedMemory:
 class Lab:
     """Machines of a topology, each in a namespace.
 
-    ``own_shared_memory``: these machines have a ``/dev/shm`` each; the others see the one of the host. ``cores``: bound
-    of processor time by machine; None: the machines share all cores. ``dies_with_us``: whether the kernel kills what
-    runs on them when this process ends in any way. Raises ``LocalError``: the kernel refuses.
+    ``own_shared_memory``: these machines have a ``/dev/shm`` each; the others see the one of the host.
+    ``dies_with_us``: whether the kernel kills what runs on them when this process ends in any way. ``cores``: bound of
+    processor time by machine; None: the machines share all cores. Raises ``LocalError``: the kernel refuses.
     """
 
     def __init__(
@@ -61,7 +61,6 @@ class Lab:
         topology: Topology,
         *,
         own_shared_memory: Sequence[str] = (),
-        cores: Mapping[str, int] | None = None,
         dies_with_us: bool = True,
     ) -> None:
         self.run = run
@@ -69,7 +68,7 @@ class Lab:
         self.topology = topology
         self.namespaces = Namespaces(topology, run)
         self._memories = {node: SharedMemory(run, node) for node in own_shared_memory}
-        self.cores = MachineCores(run, dict(cores)) if cores else None
+        self.cores: MachineCores | None = None
         self._dies_with_us = dies_with_us
         path = {"PYTHONPATH": python_path(_BENCH)}
         self.machines = {

@@ -64,10 +64,13 @@ _PRELOADED: Final = (
 _STARTERS: Final = {"fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo", "up", "join", "domain"}
 _NATIVE: Final = {"rclpy", "cyclonedds"}  # they leave their network in destructors
 _PLAIN: Final = re.compile(r"(?:[\w ./:,=@+%-]|'[^']*')+")  # a shell takes it for words
-_DECODER: Final = "from proxy.recordings.child import main"  # a line of its code: Python runs it by ``-c``
 _PACKAGES: Final = ("gdp", "proxy", "fog", "gdp_extensions", "ring", "internet_demo", "fog_demo", "lab")
+_DECODER: Final = re.compile(r"^from proxy\.recordings\.child import main$", re.MULTILINE)  # Python runs it by ``-c``
+# On a machine of a laboratory such code is a program; elsewhere it may be about what an import does.
+_OURS: Final = re.compile(rf"^(?:from|import) (?:{'|'.join(_PACKAGES)})\b", re.MULTILINE)
 _KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
 _SETTINGS: Final = ("PYTHON", "LD_", "COVERAGE")
+_LIBRARIES: Final = "LD_LIBRARY_PATH"
 _SPACES: Final = ("ipc", "mnt", "pid", "user", "uts")
 _LIMITS: Final = tuple(value for name, value in vars(resource).items() if name.startswith("RLIMIT_"))
 _REQUEST_BYTES: Final = 1 << 18
@@ -122,7 +125,7 @@ class Program:
             return replace(program, file=words[0]) if Path(words[0]).name in _scripts() else None
         if words[1:2] == ["-m"] and len(words) > 2 and words[2].partition(".")[0] in _PACKAGES:
             return replace(program, module=words[2])
-        if words[1:2] == ["-c"] and len(words) > 2 and _DECODER in words[2].splitlines():
+        if words[1:2] == ["-c"] and len(words) > 2 and (_DECODER if not spaces else _OURS).search(words[2]):
             return replace(program, code=words[2])
         if len(words) > 1 and words[1].endswith(".py") and Path(words[1]).resolve().is_relative_to(ROOT):
             return replace(program, file=words[1])
@@ -459,8 +462,13 @@ def _show(argv: Sequence[str], environment: Mapping[str, str]) -> None:
 
 
 def _settings(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables that an interpreter or its libraries read before a program can change them."""
-    return {name: value for name, value in environment.items() if name.startswith(_SETTINGS) and name not in _KEPT}
+    """Return the variables that an interpreter or its libraries read before a program can change them.
+
+    A folder of libraries that does not exist is no setting: OpenCV adds one where a process imports it.
+    """
+    found = {name: value for name, value in environment.items() if name.startswith(_SETTINGS) and name not in _KEPT}
+    folders = [each for each in found.pop(_LIBRARIES, "").split(os.pathsep) if os.path.isdir(each)]
+    return {**found, **({_LIBRARIES: os.pathsep.join(folders)} if folders else {})}
 
 
 def _place() -> list[str]:

@@ -22,7 +22,6 @@ from gdp.host.interruption import let_nothing_interrupt
 from gdp.host.run_registry import Run, RunRegistry, in_first_user_namespace
 from gdp.intervals import ADVERTISEMENT
 from lab.command import FAILED, PASSED, console_of, end_on_signals, exit_with, new_app
-from lab.cores import CORES_HELP
 from lab.credentials import METRICS_PORTS
 from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
@@ -118,7 +117,9 @@ def ring(
     lease: Annotated[
         float, typer.Option(help="Of names, in seconds: what is not renewed is forgotten.")
     ] = ADVERTISEMENT.lease_s,
-    cores: Annotated[bool, typer.Option("--cores", help=CORES_HELP)] = False,
+    cores: Annotated[
+        bool, typer.Option("--cores", help="Two cores' worth for the robot, four for each edge server, by cgroups.")
+    ] = False,
     wide: Annotated[bool, typer.Option("--wide", help="All columns of the table, 200 characters.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
     down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,

@@ -11,7 +11,7 @@ from lab.credentials import Carried, Yaml
 from lab.dds import ros_environment
 from proxy.config.config import Encoding
 from proxy.serial.channel import RosVersion
-from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, TALKS
+from ring.nodes.content import LAMP, LAMP_TYPE, TALKS
 from ring.options import Live
 
 MASTER_PORT: Final = 11_311
@@ -68,10 +68,5 @@ def paces(camera_hz: float) -> dict[str, float]:
 
 
 def messages_in(seconds: float, hz: float) -> int:
-    """Return the number of messages that a talker publishes."""
+    """Return the number of messages that a talker publishes, or of calls."""
     return max(round(hz * seconds), 1)
-
-
-def calls_in(seconds: float) -> int:
-    """Return the number of calls of the lamp."""
-    return max(round(LAMP_HZ * seconds), 1)

@@ -18,8 +18,8 @@ from lab.process import Event, LabProcess
 from lab.supervisor import Supervisor
 from lab.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
-from ring.live_plan import MASTER_PORT, Graph, calls_in, carried_in, graphs_of, messages_in, paces
-from ring.nodes.content import LAMP
+from ring.live_plan import MASTER_PORT, Graph, carried_in, graphs_of, messages_in, paces
+from ring.nodes.content import LAMP, LAMP_HZ
 from ring.options import Live, Options
 from ring.overlay import Injection, Overlay
 from ring.result import Heard, Result, rows
@@ -157,7 +157,7 @@ class LiveRing:
         (robot, at_robot, _), (server, at_server, _) = self._ends
         seconds, talking = self._options.live_s, paces(self._options.camera_hz)
         counts = {name: messages_in(seconds, hz) for name, hz in talking.items()}
-        calls = calls_in(seconds)
+        calls = messages_in(seconds, LAMP_HZ)
         self._reporter.step(f"starting nodes at {robot.switch}, ROS {at_robot.ros}: {', '.join(talking)}, lamp")
         self._reporter.step(f"starting nodes at {server.switch}, ROS {at_server.ros}: listener, caller")
         words = {name: [str(counts[name]), str(hz)] for name, hz in talking.items()}

@@ -59,16 +59,16 @@ class ReleaseError(Exception):
     """Verification failed, or a file cannot be made; the text gives the reason."""
 
 
-def build(out: Path, root: Path = ROOT, commit: str = "HEAD") -> None:
-    """Make sdist, wheel, SBOM, lock and SHA256SUMS of a commit in a new or empty folder.
+def build(out: Path, root: Path = ROOT) -> None:
+    """Make sdist, wheel, SBOM, lock and SHA256SUMS of the commit in a new or empty folder.
 
     Raises ``ReleaseError``: the folder holds something, or a tool failed.
     """
     out.mkdir(parents=True, exist_ok=True)
     if any(out.iterdir()):
         raise ReleaseError(f"{out} is not empty")
-    epoch = _run(["git", "-C", str(root), "log", "-1", "--format=%ct", commit]).strip()
-    with _checked_out(root, commit) as source, tempfile.TemporaryDirectory() as made:
+    epoch = _run(["git", "-C", str(root), "log", "-1", "--format=%ct"]).strip()
+    with _checked_out(root) as source, tempfile.TemporaryDirectory() as made:
         env = {**os.environ, "SOURCE_DATE_EPOCH": epoch, "PYTHONHASHSEED": "0"}
         _run([sys.executable, "-c", _BACKEND, made], cwd=source, env=env)
         (sdist,), (wheel,) = Path(made).glob("*.tar.gz"), Path(made).glob("*.whl")
@@ -116,7 +116,6 @@ def main(words: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     building = commands.add_parser("build", help="make the files of a release")
     building.add_argument("--out", type=Path, required=True, help="a new or empty folder")
-    building.add_argument("--commit", default="HEAD", help="what to build")
     signing = commands.add_parser("sign", help="sign SHA256SUMS")
     signing.add_argument("--key", type=Path, required=True, help="owner.key of gdp keygen owner")
     checking = commands.add_parser("verify", help="verify signature and hashes")
@@ -126,7 +125,7 @@ def main(words: Sequence[str] | None = None) -> int:
     given = parser.parse_args(words)
     try:
         if given.command == "build":
-            build(given.out, commit=given.commit)
+            build(given.out)
         elif given.command == "sign":
             sign(given.folder, given.key)
         else:
@@ -165,9 +164,9 @@ def _check_sums(folder: Path) -> list[str]:
 
 
 @contextlib.contextmanager
-def _checked_out(root: Path, commit: str) -> Iterator[Path]:
-    """Yield a folder with the files of a commit, with the modes of umask 022."""
-    words = ["git", "-C", str(root), "-c", "tar.umask=022", "archive", "--format=tar", commit]
+def _checked_out(root: Path) -> Iterator[Path]:
+    """Yield a folder with the files of the commit, with the modes of umask 022."""
+    words = ["git", "-C", str(root), "-c", "tar.umask=022", "archive", "--format=tar", "HEAD"]
     archive = subprocess.run(words, capture_output=True, check=False)
     if archive.returncode:
         raise ReleaseError(archive.stderr.decode(errors="replace").strip())

@@ -9,7 +9,8 @@ number is derived from the content, and a time stands in it only where SOURCE_DA
 
 ``cyclonedx-bom`` lists the pins of a lock with their hashes, but neither licences nor dependencies.
 
-Source: https://cyclonedx.org/docs/1.6/json/; package URLs: https://github.com/package-url/purl-spec.
+Source: https://cyclonedx.org/docs/1.6/json/; package URLs: https://github.com/package-url/purl-spec;
+locks: pip's "Requirements File Format" and "Secure installs"; names as in PEP 503, markers as in PEP 508.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ import datetime
 import hashlib
 import json
 import os
+import re
 import sys
 import uuid
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
-from locks import LockError, Pin, read_lock
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
@@ -36,7 +38,51 @@ else:
     tomllib = None
 
 ROOT = Path(__file__).parents[2]
+_PIN = re.compile(r"(?P<name>[\w.\-]+)(?:\[[\w,.\- ]+\])?==(?P<version>[\w.!+\-]+)(?: *; *(?P<marker>[^\\]+?))?\Z")
+_HASH = re.compile(r"--hash=sha256:([0-9a-f]{64})\Z")
 _LICENCE_MAX_CHARS = 200  # some packages put the whole text there
+
+
+class LockError(Exception):
+    """File that is not a lock; the text names the line."""
+
+
+@dataclass(frozen=True)
+class Pin:
+    """One version of one package.
+
+    ``name``: as PEP 503 writes it. ``marker``: condition; empty: everywhere. ``hashes``: SHA-256 of each archive that
+    may be installed, hex.
+    """
+
+    name: str
+    version: str
+    marker: str
+    hashes: frozenset[str]
+
+
+def read_lock(path: Path) -> list[Pin]:
+    """Return the pins of a lock, in order.
+
+    Raises ``LockError``: a line that is neither a pin with hashes nor a comment. Raises ``OSError``: it cannot be read.
+    """
+    pins: list[Pin] = []
+    joined = ""
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        text = line.strip()
+        if not joined and (not text or text.startswith("#")):
+            continue
+        joined += " " + text.removesuffix("\\").strip()
+        if text.endswith("\\"):
+            continue
+        requirement, *options = re.split(r" (?=--)", joined.strip())
+        match, hashes = _PIN.match(requirement.strip()), [_HASH.match(option.strip()) for option in options]
+        if match is None or not hashes or None in hashes:
+            raise LockError(f"{path}:{number}: expected name==version with --hash=sha256:HEX")
+        digests = frozenset(each[1] for each in hashes if each)
+        pins.append(Pin(canonicalize_name(match["name"]), match["version"], (match["marker"] or "").strip(), digests))
+        joined = ""
+    return pins
 
 
 def bill(pins: Sequence[Pin], name: str, version: str, direct: Sequence[str], epoch_s: int | None) -> dict[str, Any]:

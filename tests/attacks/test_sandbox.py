@@ -56,6 +56,47 @@ print(json.dumps(found))
 """
 
 
+OPEN_ALONE = """
+from gdp.errors import LocalError
+from gdp.ports.kernel.keepalives import KeepaliveSessions
+from gdp.ports.kernel.program import LICENCE
+from gdp.ports.kernel.syscall import load_program
+from gdp.ports.kernel.assembler import Assembler
+from gdp.ports.sandbox import Capability, Needs, confine
+try:
+    sessions = KeepaliveSessions()
+except LocalError as refused:
+    print("skip", str(refused).partition(chr(10))[0])
+    raise SystemExit
+passing = Assembler()
+passing.leave(-1)
+code = passing.assemble()
+confine(Needs(capabilities=frozenset(Capability), uses_open_programs=True))
+sessions._slots.put_many([bytes(4)], [bytes(4)])
+sessions._ends.put(bytes(36), bytes(4))
+print(sessions._ends.remove(bytes(36)))
+sessions._run(1)
+for attempt in (lambda: load_program(code, "more", LICENCE), KeepaliveSessions):
+    try:
+        attempt()
+        print("done")
+    except LocalError as refused:
+        print("EPERM" in str(refused))
+"""
+
+
+def test_a53_an_end_runs_the_programs_that_it_has_open_and_loads_no_other() -> None:
+    if not seccomp.denied(os.uname().machine):
+        pytest.skip("no list of system calls for this machine")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", OPEN_ALONE]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
+    if done.stdout.startswith("skip"):
+        pytest.skip(done.stdout)
+    assert done.stdout.split() == ["True"] * 3
+
+
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     """Result of each attempt: ``done``, or an error number."""

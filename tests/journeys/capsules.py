@@ -30,7 +30,7 @@ from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow
 
 STORE = "/store"
-_STEP_S = 0.005  # between two turns of work, as a busy loop would have
+_STEP_S = 0.02  # between two turns of work
 BACKGROUND = SendOptions(priority="background")
 LIMITS = StoreLimits(owner_bytes=1 << 30, spare_bytes=0)
 

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import ceil
+from typing import Final
 
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Participant, Topic
@@ -16,9 +17,17 @@ from gdp.intervals import SCAPY_KEEPALIVE_MS
 from gdp.names import Name
 from gdp.trust.right import Right
 from lab.simulation import Simulation
-from lab.topology import ring5
+from lab.topology import Attachment, DomainPlan, Link, Topology, ring5
 
 ROBOT, SERVER = "nuc1/robot", "nuc5/server"
+ROW: Final = Topology(  # three of the ring's switches in two domains: a third of its frames
+    (Link("nuc1", "nuc2"), Link("nuc2", "nuc5")),
+    (DomainPlan("school", ("nuc1", "nuc2"), upper="cloud"), DomainPlan("cloud", ("nuc5",))),
+    (
+        *(Attachment("nuc2", "rib", "rib"), Attachment("nuc5", "rib", "rib")),
+        *(Attachment("nuc1", "proxy", "robot"), Attachment("nuc5", "proxy", "server")),
+    ),
+)
 LEASE_S = 2.5  # of names; with it three leases outlast those of readers and of branches, too
 LEASES = 3.05  # after which a flow has outlived three, whatever the rounding
 STEP_S = 0.25  # between messages of a flow that is to outlive leases
@@ -159,6 +168,13 @@ def ring(
 ) -> Simulation:
     """Return the ring of five, with every member attached."""
     world = Simulation(topology=ring5(), seed=seed, transits=transits, lease_s=lease_s, keepalive_ms=keepalive_ms)
+    assert world.run_until_attached()
+    return world
+
+
+def row(seed: int = 1, *, lease_s: float = LEASE_S, keepalive_ms: int | None = SCAPY_KEEPALIVE_MS) -> Simulation:
+    """Return ``ROW``, with every member attached, for tests whose subject is not the path."""
+    world = Simulation(topology=ROW, seed=seed, lease_s=lease_s, keepalive_ms=keepalive_ms)
     assert world.run_until_attached()
     return world
 

@@ -15,7 +15,7 @@ from gdp.intervals import TICK_S
 from gdp.stores.capsule_store import stored
 from tests.draws import TIMES
 from tests.journeys.capsules import Holder, Keeping, opened, read_from
-from tests.journeys.flows import ROBOT, advertise, ring
+from tests.journeys.flows import ROBOT, advertise, row
 
 SECOND_NS = 1_000_000_000
 BEFORE_NS, AFTER_NS = 3 * SECOND_NS, 2 * SECOND_NS
@@ -31,7 +31,7 @@ class Recorded:
     """
 
     def __init__(self, folder: Path, most_bytes: int = 1 << 24) -> None:
-        self.world = ring()
+        self.world = row()
         self.folder = folder
         self.most_bytes = most_bytes
         self.written: list[tuple[int, bytes]] = []

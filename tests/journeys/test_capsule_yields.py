@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.journeys.capsules import Holder, Keeping
-from tests.journeys.flows import ROBOT, SERVER, advertise, ring
+from tests.journeys.flows import ROBOT, SERVER, advertise, row
 
 UPLINK_BYTES_S = 1_250_000
 IMAGE_BYTES = 40_000
@@ -20,11 +20,12 @@ ALONE_S = 0.043  # an image at this rate, as a loop of 5 ms sees it
 def test_a_live_image_waits_little_for_an_upload_unless_the_ring_fills(
     tmp_path: Path, backlog: bool, ring_bytes: int
 ) -> None:
-    world = ring()
-    world.add_member("nuc3/store", "nuc3")
+    world = row()
+    world.add_member("nuc2/store", "nuc2")
     assert world.run_until_attached()
     keeping = Keeping(advertise(world), tmp_path / "robot", ring_bytes)
-    holder = Holder(world, tmp_path / "holder", "nuc3/store")
+    keeping.step_s = 0.005
+    holder = Holder(world, tmp_path / "holder", "nuc2/store")
     camera = advertise(world, "/camera", reliable=False)
     camera.read_by(SERVER)
     assert world.network.run(5, lambda: camera.is_read_by(1))

@@ -165,7 +165,7 @@ class _Recordings(dict[bytes, Sequence[int]]):
 @pytest.mark.skipif(not UPLINKS.is_dir(), reason="the recorded uplinks are not there (expected in ../shared/data)")
 @pytest.mark.parametrize(
     ("name", "length_s"),
-    [("Verizon-LTE-short", 25), *nightly(("Verizon-LTE-short", 120), ("ATT-LTE-driving-2016", 120))],
+    [("Verizon-LTE-short", 18), *nightly(("Verizon-LTE-short", 120), ("ATT-LTE-driving-2016", 120))],
 )
 def test_the_offset_over_a_loaded_lte_uplink_is_known_to_five_milliseconds(name: str, length_s: int) -> None:
     uplink = Uplink(name)

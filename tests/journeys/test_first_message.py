@@ -243,7 +243,7 @@ RESTARTED = Plan("chain", 2, 1, (THIN,), False, True, True, 40, 20_000, 1.0, "re
 @pytest.mark.momentary(
     "every trial runs for three leases after its last reader; hypothesis also draws shorter attempts"
 )
-@draws(3)
+@draws(1, long=12)
 @given(plans())
 @example(OLDER)
 @example(KILLED)

@@ -13,10 +13,10 @@ from gdp.capsule.record import RecordType
 from gdp.stores.capsule_store import StoreLimits, stored
 from tests.draws import TIMES
 from tests.journeys.capsules import LIMITS, Holder, Keeping, opened, records_at
-from tests.journeys.flows import ROBOT, Tap, advertise, ring
+from tests.journeys.flows import ROBOT, Tap, advertise, row
 
 NAMES = "/store-a", "/store-b", "/store-c"
-PLACES = "nuc1/holder", "nuc3/holder", "nuc4/holder"  # of two domains
+PLACES = "nuc1/holder", "nuc2/holder", "nuc5/holder"  # of two domains
 
 
 def keeping_at(
@@ -25,9 +25,10 @@ def keeping_at(
     limits: StoreLimits = LIMITS,
     most_bytes: int = 1 << 24,
     around_ns: tuple[int, int] | None = None,
+    lease_s: float = 6.0,
 ) -> tuple[Keeping, list[Holder]]:
     """Return a robot that keeps a topic with some holders."""
-    world, names = ring(), NAMES[:count]
+    world, names = row(lease_s=lease_s), NAMES[:count]
     for place in PLACES[:count]:
         world.add_member(place, place.partition("/")[0])
     assert world.run_until_attached()
@@ -53,7 +54,7 @@ def have_all(keeping: Keeping, holders: Sequence[Holder]) -> bool:
 
 
 def test_one_copy_goes_up_and_every_holder_confirms_its_own(tmp_path: Path) -> None:
-    keeping, holders = keeping_at(tmp_path, 3)
+    keeping, holders = keeping_at(tmp_path, 3, lease_s=2.5)
     tap = Tap(ROBOT, "nuc1")
     keeping.flow.world.network.taps.append(tap)
     sent = keeping.publish_at([0.05 * each for each in range(160)], lambda each: bytes(6_000) + b"%d" % each)
@@ -142,7 +143,7 @@ def test_windows_around_events_are_the_same_at_every_holder(tmp_path: Path) -> N
 
 def test_what_one_holder_alone_has_fills_the_gap_of_another(tmp_path: Path) -> None:
     """The robot's ring dropped what only a holder that died had."""
-    keeping, (first, second) = keeping_at(tmp_path, 2, most_bytes=200_000)
+    keeping, (first, second) = keeping_at(tmp_path, 2, most_bytes=200_000, lease_s=2.5)
     network, leads = keeping.flow.world.network, keeping.flow.world.leads
     sent = keeping.publish_at([0.05 * each for each in range(300)], lambda each: bytes(3_000) + b"%d" % each)
     network.set_link(leads[second.label], up=False)

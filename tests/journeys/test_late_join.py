@@ -17,9 +17,9 @@ from gdp.session.protocol.client_core import Call, ClientCore
 from gdp.trust.right import Right
 from lab.simulation import Simulation
 from tests.journeys.capsules import BACKGROUND, STORE, Holder, Keeping
-from tests.journeys.flows import advertise, ring
+from tests.journeys.flows import advertise, row
 
-READER = "nuc3/edge"
+READER = "nuc2/edge"
 
 
 @dataclass
@@ -76,8 +76,8 @@ def joining(
     tmp_path: Path, *, depth: int = 0, messages: int = 1_000, age_s: float | None = None, has_holder: bool = True
 ) -> tuple[Joiner, int]:
     """Return a joiner that came after 200 messages of ten seconds, while 60 more came; and how many there are."""
-    world = ring()
-    world.add_member(READER, "nuc3")
+    world = row(lease_s=5.0)
+    world.add_member(READER, "nuc2")
     assert world.run_until_attached()
     keeping = Keeping(advertise(world, depth=depth), tmp_path / "robot")
     holder = Holder(world, tmp_path / "holder")

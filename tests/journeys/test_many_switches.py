@@ -9,6 +9,7 @@ import pytest
 from lab.simulation import Simulation
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import flowing
+from tests.lanes import nightly
 
 DOMAINS = 8
 
@@ -45,7 +46,7 @@ def wide(switches: int, seed: int = 1) -> Topology:
     )
 
 
-@pytest.mark.parametrize("switches", [8, pytest.param(25, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("switches", [5, *nightly(8, 25)])
 def test_up_to_two_hundred_switches_settle_and_deliver(switches: int) -> None:
     world = Simulation(topology=wide(switches), hello_s=5.0, dead_s=18.0, lease_s=5.0, keepalive_ms=4_000)
     assert len(world.switches) == DOMAINS * switches

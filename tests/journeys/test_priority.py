@@ -6,7 +6,7 @@ import pytest
 
 from gdp.client.send_scheduler import BYTES_WITH_URGENT
 from gdp.frame.codec import Flag, Kind, decode
-from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
+from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, row
 
 IMAGE = bytes(921_600)
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.momentary("the order of frames within one turn of the l
 
 
 def test_an_urgent_message_leaves_before_what_waits_of_others() -> None:
-    world = ring()
+    world = row()
     images = flowing(world, "/image")
     urgent = advertise(world, "/cmd_vel", urgent=True)
     urgent.read_by(SERVER)
@@ -32,7 +32,7 @@ def test_an_urgent_message_leaves_before_what_waits_of_others() -> None:
 
 
 def test_topics_that_are_not_urgent_take_turns() -> None:
-    world = ring()
+    world = row()
     flows = [flowing(world, name) for name in ("/left", "/right")]
     member, now_s = world.members[ROBOT], world.network.now.mono_s
     for flow in flows:
@@ -44,7 +44,7 @@ def test_topics_that_are_not_urgent_take_turns() -> None:
 
 
 def test_an_urgent_message_waits_for_no_more_than_a_chunk_of_a_best_effort_image() -> None:
-    world = ring()
+    world = row()
     images = flowing(world, "/image", reliable=False)
     urgent = advertise(world, "/cmd_vel", urgent=True)
     urgent.read_by(SERVER)

@@ -15,7 +15,7 @@ from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from lab.simulation import Simulation
-from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
+from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, row
 
 LASTS_S = 30  # of a short membership, clocks' differences included
 RENEWED_S = 20
@@ -26,8 +26,8 @@ SKEW_S = int(CLOCK_SKEW_S)
 
 
 def settled() -> Simulation:
-    """Return the ring, where no link fails, and names outlast what is renewed here by little."""
-    return ring(lease_s=8.0, keepalive_ms=2_000)
+    """Return a network where no link fails, and names outlast what is renewed here by little."""
+    return row(lease_s=8.0, keepalive_ms=2_000)
 
 
 def unix_s(world: Simulation) -> int:

@@ -21,7 +21,7 @@ from gdp.sansio import ReceivedFrame
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
 from lab.simulation import Simulation
-from tests.journeys.flows import ROBOT, SERVER, Tap, ring
+from tests.journeys.flows import ROBOT, SERVER, Tap, row
 from tests.journeys.services import Party, meet, outlive, work
 
 ANSWER = b"? by nuc5/server"
@@ -73,7 +73,7 @@ class Pair:
 
 def pair_of(server: bool = True, client: bool = True, world: Simulation | None = None) -> Pair:
     """Return a server and a client that know each other; each asks for a session secret or does not."""
-    world = ring() if world is None else world
+    world = row() if world is None else world
     parties = (
         Party(world, SERVER, Right.SERVE, is_session=server),
         Party(world, ROBOT, Right.CALL, is_session=client),

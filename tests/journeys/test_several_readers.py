@@ -17,7 +17,7 @@ from tests.lanes import nightly
 SWITCHES = ("s0", "s1", "s2", "s3", "s4")
 READERS = ("s2/r2", "s3/r3", "s4/r4")
 IMAGE_BYTES, OFFERED = 30_000, 2.0  # images offer so much of the link
-FULL_S, SETTLED_S = 15.0, 2.0
+FULL_S, SETTLED_S = 10.0, 2.0
 LEASE_S = 8.0  # a shorter one may end before a renewal has passed a full link
 
 

@@ -19,7 +19,7 @@ LEASE_S = 6.0  # of names, where the real one would only cost time: that of read
 SHORT_S = 3 * LEASE_S + 8
 KEEPALIVE_MS = 1_000  # where no link fails in silence, the real ones would only cost time, too
 WIDE_BYTES = 9_000  # MTU of links; how statements of RIBs are split is the subject of other files, and of the ring here
-PERIOD_S = 0.2  # between messages: several are published during each fault
+PERIOD_S = 0.25  # between messages: several are published during each fault
 NIGHTLY = pytest.mark.nightly  # much like another case, or its mirror image: messages go both ways
 
 
@@ -149,11 +149,11 @@ def test_established_flows_go_on_while_all_ribs_are_dead_for_minutes(minutes: in
 def test_ribs_that_were_dead_for_long_come_back_without_a_flow_noticing() -> None:
     world = sites(ADVERTISEMENT.lease_s)
     flow = flowing(world, source=A, readers=(C,))
-    flow.stream(500, 0.2, size=100)
+    flow.stream(250, 0.4, size=100)
     for label in world.ribs:
         world.network.call(2.0, partial(world.kill_rib, label))
         world.network.call(46.0, partial(restart_rib, world, label))
-    complete(flow, C, 500, 110)
+    complete(flow, C, 250, 110)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import time
 from collections import deque
 from ipaddress import ip_address, ip_network
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -20,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
 from background_load import load_of
-from messages import CPU, MEDIAN, case_of, targets_of
+from messages import CPU, MEDIAN, UNSIGNED, case_of, measure_one, targets_of
 from peers.certificates import make_certificates
 from peers.chain import NODES, address, routes
 from peers.exchange import ANSWER, IMAGE, SIZE_MIN, answer_to, exchange, image
@@ -195,6 +196,24 @@ def test_the_processor_time_of_each_end_is_asked_for_a_small_message() -> None:
     over.add("gdp-kernel", case, CPU["receiver"], 0.2)
     targets = [each for each in targets_of(over, ["gdp-kernel"], [(100, 1_500, False)]) if "CPU" in each.what]
     assert [(each.target, each.met) for each in targets] == [(0.12, True), (0.12, False)]
+
+
+def test_the_cost_of_ecdsa_is_taken_off_a_signed_small_message_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("messages.signature_pair_s", lambda: 0.000_1)
+    over, case = Rounds(), case_of(100, 1_500, loaded=False)
+    nowhere: Any = SimpleNamespace()
+
+    def baseline(_: object, **__: int) -> dict[str, Any]:
+        return {"rtt_s": [0.000_5], "cpu_s": {}}
+
+    for name, pairs in (("gdp-kernel", 2), ("zenoh-mtls", 0)):
+        for column, value in measure_one(baseline, nowhere, 100, 1, False, pairs, 0).items():
+            over.add(name, case, column, value)
+    (target,) = [each for each in targets_of(over, ["gdp-kernel"], [(100, 1_500, False)]) if "less two" in each.what]
+    assert target.measured is not None
+    assert target.measured.median == pytest.approx(0.6)
+    assert (target.target, target.met) == (0.4, False)
+    assert over.column("zenoh-mtls", case, UNSIGNED) == [pytest.approx(0.5)]
 
 
 def test_a_ratio_with_the_cores_half_taken_has_a_target_of_its_own() -> None:

@@ -343,8 +343,7 @@ def test_the_grid_of_the_command_line_is_every_combination_of_what_was_chosen() 
 
 def test_the_camera_is_compressed_on_a_thin_link() -> None:
     thin, wide = (Conditions.of(rate, 60, "0", "bdp", seed=1) for rate in ("20", "100"))
-    assert [uplink.camera_of(link, "auto") for link in (thin, wide)] == ["jpeg", "raw"]
-    assert uplink.camera_of(thin, "raw") == "raw"
+    assert [uplink.camera_of(link) for link in (thin, wide)] == ["jpeg", "raw"]
 
 
 def test_ours_is_compared_with_the_better_transport_of_zenoh() -> None:
@@ -357,6 +356,6 @@ def test_ours_is_compared_with_the_better_transport_of_zenoh() -> None:
 
 def test_every_link_has_targets_for_urgency_freshness_and_fairness() -> None:
     links = [Conditions.of("10", 60, "0", "second", seed=1)]
-    found = [target.what for target in uplink.targets_of(Rounds(), links, "auto")]
+    found = [target.what for target in uplink.targets_of(Rounds(), links)]
     for what in ("cmd_vel", "tf", "camera", score.SHARE_BOTH, score.TCP_BOTH):
         assert any(what in each for each in found)

@@ -14,16 +14,13 @@ from pathlib import Path
 
 import availability
 import machine
-import papers
 import pytest
 import table1
 import uplink
 from machine import MachineState, machine_state
 from report import Rounds, write_json
-from results import THIS_RUN, rows_of
 from skeleton import Outcome, command_line, parse, perform
 
-import make_catalog
 from tests.pages import ROOT
 
 DATA = ROOT / "scripts" / "data"
@@ -47,9 +44,8 @@ def ends(capsys: pytest.CaptureFixture[str]) -> Ends:
 
 
 def on(monkeypatch: pytest.MonkeyPatch, state: MachineState) -> None:
-    """Let experiments and benches find a machine in this state; spreads are estimated quickly."""
-    monkeypatch.setattr("results._RESAMPLES", 20)
-    for module in ("experiment", "skeleton", "papers"):
+    """Let experiments and benches find a machine in this state."""
+    for module in ("experiment", "skeleton"):
         monkeypatch.setattr(f"{module}.machine_state", lambda: state)
 
 
@@ -77,7 +73,6 @@ def test_a_command_without_its_data_says_which_file_and_how_to_get_it(
     said = ends(lambda: availability.main(["--out", str(tmp_path / "out")]))
     assert f"no {tmp_path}/spot/aws_*.json: git checkout -- scripts/data restores it" in said
     assert not list((tmp_path / "out").iterdir())
-    assert "spot-advisor-data.json" in ends(make_catalog.main)
     monkeypatch.setattr("sys.argv", ["uplink.py", "--quick", "--rates", "Radio", "--traces", str(tmp_path)])
     assert f"no recording {tmp_path}/Radio.up" in ends(lambda: perform(parse(uplink.arguments()), uplink.measure))
 
@@ -109,7 +104,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
 ) -> None:
     on(monkeypatch, QUIET)
-    monkeypatch.setattr(table1, "bills", lambda region: pytest.fail("measured"))
+    monkeypatch.setattr(table1, "applications", lambda: pytest.fail("measured"))
     (tmp_path / "file").touch()
     said = ends(lambda: table1.main(["--out", str(tmp_path / "file" / "out")]))
     assert f"{tmp_path}/file/out cannot be written (Not a directory): choose another folder" in said
@@ -119,7 +114,7 @@ def test_a_busy_machine_writes_no_page_but_runs_quickly_or_marks_its_rows(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
 ) -> None:
     on(monkeypatch, BUSY)
-    monkeypatch.setattr("pictures.save", lambda figure, path: path.touch())
+    monkeypatch.setattr("plot.save", lambda figure, path, **_: path.touch())
     said = ends(lambda: availability.main(["--out", str(tmp_path)]))
     assert "the load before, 1.50, exceeds half of 2 cores" in said
     assert "--allow-load" in said
@@ -190,57 +185,3 @@ def test_a_tree_without_git_writes_no_page_but_runs_quickly(tmp_path: Path) -> N
     assert f"{tree} is no git repository: clone it by git, or use --quick" in line
     assert not (tree / "docs" / "experiments" / "table1.md").exists()
     assert subprocess.run([*argv, "--quick"], env=environment, capture_output=True, check=False).returncode == 0
-
-
-@pytest.fixture
-def scripts(tmp_path: Path) -> Path:
-    """Return a folder of experiments: ``fig9`` and ``availability`` fail, the others write their JSON."""
-    folder = tmp_path / "scripts"
-    folder.mkdir()
-    shipped = ROOT / "docs" / "experiments"
-    for name in papers.EXPERIMENTS:
-        copy = f"import shutil, sys; shutil.copy({str(shipped / name)!r} + '.json', sys.argv[2])"
-        (folder / f"{name}.py").write_text("raise SystemExit(1)" if name in ("fig9", "availability") else copy)
-    return folder
-
-
-def test_a_failed_experiment_fails_the_whole_and_no_table_is_written(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scripts: Path
-) -> None:
-    on(monkeypatch, QUIET)
-    out = tmp_path / "out"
-    with pytest.raises(SystemExit, match=r"failed: fig9; no table is written"):
-        papers.main(["--only", "table1", "--only", "fig9", "--folder", str(out)], scripts)
-    assert {path.name for path in out.iterdir()} == {"table1.json"}
-
-
-def test_a_row_of_an_earlier_run_names_its_day_commit_and_load(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scripts: Path
-) -> None:
-    on(monkeypatch, QUIET)
-    out = tmp_path / "out"
-    papers.main(["--only", "fig6", "--folder", str(out)], scripts)
-    document = json.loads((out / "fig6.json").read_text(encoding="utf-8"))
-    document["machine"] = asdict(replace(BUSY, commit="0ld", date="2026-01-02"))
-    (out / "fig6.json").write_text(json.dumps(document), encoding="utf-8")
-    papers.main(["--only", "table1", "--folder", str(out)], scripts)
-    rows = json.loads((out / "results.json").read_text(encoding="utf-8"))
-    measured = {row["figure"]: row["measured"] for row in rows}
-    assert measured == {"FT Table I": THIS_RUN, "FT Figure 6": "earlier: 2026-01-02, commit 0ld, load 1.5"}
-    page = (out / "papers.md").read_text(encoding="utf-8")
-    assert "Not complete.** Not measured: offload, fig4, fig5, fig7, fig9, outages." in page
-
-
-def test_a_row_measured_now_under_load_is_marked(tmp_path: Path) -> None:
-    document = json.loads((ROOT / "docs/experiments/fig6.json").read_text(encoding="utf-8"))
-    (tmp_path / "fig6.json").write_text(json.dumps({**document, "machine": asdict(BUSY)}), encoding="utf-8")
-    rows, _ = rows_of(tmp_path, ["fig6"])
-    assert {row.measured for row in rows} == {f"{THIS_RUN} (load 1.5)"}
-
-
-def test_the_papers_are_not_begun_on_a_busy_machine(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
-) -> None:
-    on(monkeypatch, BUSY)
-    assert "exceeds half of 2 cores" in ends(lambda: papers.main(["--folder", str(tmp_path)]))
-    assert not list(tmp_path.iterdir())

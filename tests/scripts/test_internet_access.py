@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from itertools import product
 
-import pytest
-
 from lab.internet.access import TRAITS, Access, allows_direct, core_rules, router_rules
-from lab.internet.matrix import batches
 from tests.pages import ROOT
 
 PAGE = ROOT / "docs/reference/internet-access.md"
@@ -62,14 +59,3 @@ def test_public_access_has_no_rules() -> None:
 def test_the_core_drops_in_both_directions_only_at_cut_sites() -> None:
     assert core_rules(["port0"]).count('"port0" drop\n') == 2
     assert " drop\n" not in core_rules([])
-
-
-def test_seven_batches_of_three_kinds_hold_each_pair() -> None:
-    found = batches(Access)
-    assert {pair for batch in found for pair in product(batch, batch)} == set(product(KINDS, KINDS))
-    assert [len(batch) for batch in found] == [3] * 7
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_up_to_three_kinds_are_one_batch(count: int) -> None:
-    assert batches(KINDS[:count]) == [tuple(KINDS[:count])]

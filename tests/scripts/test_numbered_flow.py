@@ -21,10 +21,6 @@ def test_a_message_that_never_came_is_lost_and_one_that_came_again_is_doubled(fl
     assert (flow.lost, flow.doubled) == (1, 1)
 
 
-def test_the_delay_of_a_message_is_that_of_its_first_arrival(flow: NumberedFlow) -> None:
-    assert flow.delays_ms(10.0, 12.5) == [250.0, 500.0, 250.0]
-
-
 def test_a_silence_includes_the_ends_of_its_interval(flow: NumberedFlow) -> None:
     assert flow.silence_ms(12.0, 14.5) == 2_000.0
     assert flow.silence_ms(14.5, 15.0) == 500.0

@@ -2,33 +2,18 @@
 
 from __future__ import annotations
 
-import json
+from argparse import Namespace
 
 import availability
 import numpy as np
-import pytest
 import table1
 from experiment import OUTPUT
 from machine import machine_state
 
-from gdp.errors import LocalError
-
-
-def test_table_one_compares_three_ways_to_run_a_service(capsys: pytest.CaptureFixture[str]) -> None:
-    table1.main(["--json", "--quick"])
-    (first, *_) = json.loads(capsys.readouterr().out)["rows"]
-    assert [bill["of_single"] for bill in first["bills"][:2]] == [1.0, 2.0]
-    assert first["bills"][2]["of_single"] < 1 < first["times_cheaper"]
-
-
-def test_a_region_without_prices_is_refused() -> None:
-    with pytest.raises(LocalError, match="us-east-1"):
-        table1.bills("mars")
-
 
 def test_the_page_of_table_one_is_of_the_shipped_prices() -> None:
     shown = (OUTPUT / "table1.md").read_text()
-    assert shown.startswith(table1.report("us-east-1").to_text(machine_state()))
+    assert shown.startswith(table1.measure(Namespace()).to_text(machine_state()))
 
 
 def test_every_application_of_the_paper_has_its_three_prices_next_to_ours() -> None:

@@ -95,7 +95,9 @@ def test_a_script_that_asks_for_quiet_gets_no_line_of_an_environment_that_is_up_
     assert clone.setup("--quiet") == ("", [])
 
 
-@pytest.mark.parametrize("script", ["ring_topology.sh", "fog_demo.sh", "internet_demo.sh", "memory_demo.sh", "test.sh"])
+@pytest.mark.parametrize(
+    "script", ["ring_topology.sh", "fog_demo.sh", "internet_demo.sh", "memory_demo.sh", "fleet_demo.sh", "test.sh"]
+)
 def test_scripts_that_run_it_first_ask_for_quiet(script: str) -> None:
     calls = re.findall(r"scripts/setup\.sh.*", (ROOT / "scripts" / script).read_text())
     assert calls

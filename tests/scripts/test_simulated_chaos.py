@@ -19,7 +19,7 @@ from tests.insiders.oracle import signing_oracle
 from tests.scripts.simulated_chaos import SIMULATED, SimulatedChaos
 
 FIRST, COUNT = 1, TIMES
-SWITCHES, RATE, SECONDS = (12, 0.25, 40.0) if IS_LONG else (8, 0.4, 12.0)
+SWITCHES, RATE, SECONDS = (12, 0.25, 40.0) if IS_LONG else (8, 0.4, 9.0)
 THIN_BITS_S, FIFO_S, IMAGE_SHARE = 4e6, 0.2, 2.0  # images offer so much of a link
 LIMIT_S, WELL_S = 8.0, 2.0
 SILENCE_S: Final = 1.0  # of which the slowest flow's period is 0.4, and three keepalives 0.21

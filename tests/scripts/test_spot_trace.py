@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from spot_trace import (
     Trace,
     none_up,
@@ -11,10 +10,7 @@ from spot_trace import (
     pool_down,
     replica_down,
     share_with_interval,
-    times_independent,
 )
-
-from gdp.errors import LocalError
 
 
 def trace(text: str, zone: str = "a") -> Trace:
@@ -25,11 +21,9 @@ def drawn(steps: object) -> str:
     return "".join("1" if each else "0" for each in np.asarray(steps))
 
 
-def test_uptime_is_the_mean_run_before_a_preemption() -> None:
-    recorded = trace("0001100011")
-    assert recorded.preemptions == [3, 8]
-    assert recorded.uptime_s == 30.0
-    assert trace("000").uptime_s == float("inf")
+def test_a_machine_is_preempted_where_none_is_available_any_more() -> None:
+    assert trace("0001100011").preemptions == [3, 8]
+    assert trace("000").preemptions == []
 
 
 def test_a_replica_that_stays_is_down_until_it_has_recovered() -> None:
@@ -50,21 +44,9 @@ def test_none_is_up_when_all_are_down() -> None:
     assert drawn(none_up([trace("0110").taken, trace("0011").taken])) == "0010"
 
 
-def test_what_always_happens_together_is_one_over_its_share_times_as_frequent() -> None:
-    steps = trace("1000").taken
-    assert times_independent(steps, steps) == 4.0
-    assert times_independent(steps, trace("1010").taken) == 2.0
-
-
 def test_the_interval_holds_the_share_and_narrows_with_the_length() -> None:
     chance = np.random.default_rng(1)
     short, long = (share_with_interval(chance.random(size) < 0.2, 10, 400, chance) for size in (300, 30_000))
     for each in (short, long):
         assert each.low <= each.share <= each.high
     assert long.high - long.low < short.high - short.low
-
-
-@pytest.mark.parametrize("document", [{}, {"metadata": {"gap_seconds": 0}, "data": [1]}, [], "x"])
-def test_what_is_no_trace_is_refused(document: object) -> None:
-    with pytest.raises(LocalError, match="not a trace"):
-        Trace.from_document("a", document)

@@ -1,9 +1,7 @@
-"""Locks, audit, bill of materials and signed checksums: installed and released files are the intended ones."""
+"""Locks, bill of materials and signed checksums: installed and released files are the intended ones."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import platform
 import re
@@ -13,19 +11,16 @@ import sys
 import tarfile
 import uuid
 import zipfile
-from importlib.metadata import Distribution, PackageNotFoundError, distributions, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import audit
-import lock_stamp
 import pytest
 import release
 import sbom
-from advisories import AdvisoryError, is_affected, read_advisories
-from locks import LockError, Pin, read_lock
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from sbom import LockError, Pin, read_lock
 
 from gdp.stores.issue import make_owner
 from tests.draws import IS_LONG
@@ -56,29 +51,17 @@ def _has_backend() -> bool:
 needs_backend = pytest.mark.skipif(not _has_backend(), reason="setuptools is older than requirements/dev.lock has it")
 
 
-_INFO = ("METADATA", "RECORD")
-
-
 def lock(folder: Path, text: str = PINNED) -> Path:
     path = folder / "test.lock"
     path.write_text(text)
     return path
 
 
-def install(folder: Path, name: str, at: str, meta: str = "") -> Path:
-    """Install a package of one file like pip; return that file."""
-    module, info = folder / f"{name}.py", folder / f"{name}-{at}.dist-info"
+def install(folder: Path, name: str, at: str, meta: str) -> None:
+    """Write the metadata of an installed package."""
+    info = folder / f"{name}-{at}.dist-info"
     info.mkdir(parents=True)
-    module.write_text(f"NAME = {name!r}\n")
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {at}\n{meta}")
-    digest = base64.urlsafe_b64encode(hashlib.sha256(module.read_bytes()).digest()).rstrip(b"=").decode()
-    lines = [f"{name}.py,sha256={digest},{module.stat().st_size}", *(f"{info.name}/{each},," for each in _INFO)]
-    (info / "RECORD").write_text("\n".join(lines) + "\n")
-    return module
-
-
-def found(folder: Path) -> list[Distribution]:
-    return list(distributions(path=[str(folder)]))
 
 
 @pytest.fixture
@@ -88,12 +71,6 @@ def site(tmp_path: Path) -> Path:
     install(folder, "alpha", "1.2", "License-Expression: MIT\nRequires-Dist: Beta>=1\n")
     install(folder, "beta", "2.0", "Classifier: License :: OSI Approved :: BSD License\n")
     return folder
-
-
-def run(capsys: pytest.CaptureFixture[str], site: Path, *words: str | Path) -> tuple[int, list[tuple[str, str]]]:
-    """Audit a folder; return the exit code, and kind and name of each finding."""
-    code = audit.main([*map(str, words), "--json"], found(site))
-    return code, [(each["kind"], each["name"]) for each in json.loads(capsys.readouterr().out or "[]")]
 
 
 def test_every_lock_is_a_part_of_the_one_for_development() -> None:
@@ -122,17 +99,19 @@ def test_each_dependency_is_pinned_in_a_version_that_is_allowed(
         assert all(requirement.specifier.contains(each, prereleases=True) for each in pinned), requirement
 
 
-def test_each_lock_was_written_for_the_present_dependencies() -> None:
-    assert lock_stamp.outdated_locks(ROOT) == []
-
-
 def test_a_changed_dependency_makes_each_lock_outdated(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "requirements", tmp_path / "requirements")
+    (tmp_path / "scripts").mkdir()
+    shutil.copy(ROOT / "scripts" / "lock.sh", tmp_path / "scripts")
     text = (ROOT / "pyproject.toml").read_text()
-    (tmp_path / "pyproject.toml").write_text(text.replace('"typer>=', '"typer>=99.'))
-    assert lock_stamp.outdated_locks(tmp_path) == sorted(LOCKS)
-    lock_stamp.stamp_locks(tmp_path)
-    assert lock_stamp.outdated_locks(tmp_path) == []
+    outdated = []
+    for written in (text, text.replace('"typer>=', '"typer>=99.')):
+        (tmp_path / "pyproject.toml").write_text(written)
+        checked = subprocess.run(
+            ["scripts/lock.sh", "--check"], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        outdated.append((checked.returncode, [line.partition(":")[0] for line in checked.stderr.splitlines()]))
+    assert outdated == [(0, []), (1, [f"requirements/{name}" for name in LOCKS])]
 
 
 def test_a_switch_needs_no_ros_package_and_no_scapy(project: dict[str, Any]) -> None:
@@ -156,104 +135,6 @@ def test_setup_installs_by_hash_alone() -> None:
 def test_a_lock_with_a_line_that_pins_nothing_is_refused(line: str, tmp_path: Path) -> None:
     with pytest.raises(LockError, match=r"test\.lock:4: "):
         read_lock(lock(tmp_path, f"{PINNED}{line}\n"))
-
-
-def test_what_is_installed_as_pinned_has_no_findings(capsys: pytest.CaptureFixture[str], site: Path) -> None:
-    assert run(capsys, site, "--lock", lock(site)) == (0, [])
-
-
-def test_what_the_lock_does_not_pin_is_reported(capsys: pytest.CaptureFixture[str], site: Path) -> None:
-    install(site, "gamma", "3")
-    install(site, "pip", "26")  # comes with every virtual environment
-    assert run(capsys, site, "--lock", lock(site)) == (1, [("not-pinned", "gamma")])
-
-
-def test_what_a_pinned_package_carries_is_pinned_with_it(capsys: pytest.CaptureFixture[str], site: Path) -> None:
-    install(site, "gamma", "3")
-    record = site / "alpha-1.2.dist-info/RECORD"
-    record.write_text(record.read_text() + "gamma-3.dist-info/METADATA,,\n")
-    assert run(capsys, site, "--lock", lock(site)) == (0, [])
-
-
-def test_another_version_than_the_pinned_one_is_reported(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    install(tmp_path, "alpha", "1.3")
-    install(tmp_path, "beta", "2")  # 2 is 2.0
-    assert run(capsys, tmp_path, "--lock", lock(tmp_path)) == (1, [("other-version", "alpha")])
-
-
-def test_a_pin_of_another_platform_counts_for_nothing(capsys: pytest.CaptureFixture[str], site: Path) -> None:
-    elsewhere = PINNED.replace("python_version >= '3'", "sys_platform == 'win32'")
-    assert run(capsys, site, "--lock", lock(site, elsewhere)) == (1, [("not-pinned", "beta")])
-
-
-def test_a_file_that_was_changed_or_deleted_after_its_installation_is_reported(
-    capsys: pytest.CaptureFixture[str], site: Path
-) -> None:
-    (site / "alpha.py").write_text("import os\n")
-    (site / "beta.py").unlink()
-    assert run(capsys, site, "--lock", lock(site)) == (1, [("changed-file", "alpha"), ("missing-file", "beta")])
-
-
-def advisory(*ranges: tuple[str, str], versions: tuple[str, ...] = (), **other: Any) -> dict[str, Any]:
-    affected = {
-        "package": {"ecosystem": "PyPI", "name": "Al_pha"},
-        "ranges": [{"type": "ECOSYSTEM", "events": [{kind: at} for kind, at in ranges]}],
-        "versions": list(versions),
-    }
-    return {"id": "PYSEC-0000-1", "affected": [affected], **other}
-
-
-@pytest.mark.parametrize(
-    ("given", "is_hit"),
-    [
-        (advisory(("introduced", "0")), True),
-        (advisory(("introduced", "0"), ("fixed", "1.2")), False),
-        (advisory(("introduced", "0"), ("fixed", "1.2.1")), True),
-        (advisory(("introduced", "1.2"), ("fixed", "1.3")), True),
-        (advisory(("introduced", "1.2.post1")), False),
-        (advisory(("introduced", "0"), ("last_affected", "1.2")), True),
-        (advisory(("introduced", "0"), ("last_affected", "1.1")), False),
-        (advisory(("fixed", "1.1"), ("introduced", "0"), ("introduced", "1.2rc1")), True),
-        (advisory(versions=("1.2.0",)), True),
-        (advisory(versions=("1.20",)), False),
-        (advisory(("introduced", "0"), ("fixed", "no version")), True),
-        ({"id": "X", "affected": [{"package": {"ecosystem": "npm", "name": "al-pha"}, "versions": ["1.2"]}]}, False),
-        ({"id": "X", "affected": [{"package": {"ecosystem": "PyPI", "name": "other"}, "versions": ["1.2"]}]}, False),
-        ({"id": "X"}, False),
-    ],
-)
-def test_an_advisory_hits_the_versions_that_it_says(given: dict[str, Any], is_hit: bool) -> None:
-    assert is_affected(given, "al-pha", "1.2") is is_hit
-
-
-def test_a_known_hole_of_what_is_installed_is_reported(capsys: pytest.CaptureFixture[str], site: Path) -> None:
-    holes = site.parent / "holes"
-    (holes / "alpha").mkdir(parents=True)
-    hole = advisory(("introduced", "0"), summary="reads too far")
-    hole["affected"][0]["package"]["name"] = "alpha"
-    (holes / "alpha/PYSEC-0000-1.json").write_text(json.dumps(hole))
-    (holes / "withdrawn.json").write_text(json.dumps({**hole, "withdrawn": "2026-01-01T00:00:00Z"}))
-    assert audit.main(["--lock", str(lock(site)), "--advisories", str(holes)], found(site)) == 1
-    line = capsys.readouterr().out.splitlines()[0]
-    assert line.split(maxsplit=2) == ["advisory", "alpha", "1.2: PYSEC-0000-1 reads too far"]
-
-
-@pytest.mark.parametrize("text", ["", "no json", "[1]", '{"affected": []}', "[]"])
-def test_a_file_of_no_advisories_is_not_taken_for_good_news(
-    text: str, site: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = site.parent / "holes.json"
-    path.write_text(text)
-    assert audit.main(["--lock", str(lock(site)), "--advisories", str(path)], found(site)) == 2
-    assert str(path) in capsys.readouterr().err
-
-
-def test_advisories_may_stand_one_a_line(tmp_path: Path) -> None:
-    path = tmp_path / "all.jsonl"
-    path.write_text(json.dumps(advisory()) + "\n" + json.dumps(advisory()) + "\n")
-    assert len(read_advisories(path)) == 2
-    with pytest.raises(AdvisoryError):
-        read_advisories(tmp_path / "none.json")
 
 
 def test_a_bill_lists_each_pin_with_its_hashes_licence_and_needs(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:

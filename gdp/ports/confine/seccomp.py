@@ -22,7 +22,7 @@ _ALLOW: Final = 0x7FFF0000
 _REFUSE: Final = 0x00050000 | errno.EPERM
 _UNKNOWN: Final = 0x00050000 | errno.ENOSYS
 _X32: Final = 0x40000000
-_NUMBER_AT, _ARCHITECTURE_AT, _SECOND_AT = 0, 4, 24  # of struct seccomp_data; the low half of a second argument
+_NUMBER_AT, _ARCHITECTURE_AT, _FIRST_AT, _SECOND_AT = 0, 4, 16, 24  # of struct seccomp_data; low halves of arguments
 _Step = tuple[int, int, int, int]
 _STEP: Final = struct.Struct("=HBBI")
 _MACHINES: Final = {"x86_64": (0xC000003E, 317), "aarch64": (0xC00000B7, 277)}  # AUDIT_ARCH, number of seccomp(2)
@@ -97,6 +97,8 @@ _OF_COMMANDS: Final = {  # calls that are allowed with these second arguments on
     "ioctl": ((16, 29), (0x5401, 0x541B, 0x5450, 0x5451)),  # TCGETS, FIONREAD, FIONCLEX, FIOCLEX
 }
 
+_OF_OPEN: Final = (1, 2, 3, 10, 26, 28)  # bpf(2): MAP_*_ELEM, PROG_TEST_RUN, MAP_UPDATE_BATCH, LINK_CREATE
+
 
 def denied(machine: str, spared: Iterable[str] = ()) -> dict[str, int]:
     """Return the refused calls by name, with their numbers on a machine; empty if the machine is unknown.
@@ -114,16 +116,21 @@ def allowed(machine: str) -> dict[str, int]:
     return _numbers(machine, {**_READER, **{name: numbers for name, (numbers, _) in _OF_COMMANDS.items()}})
 
 
-def refuse(spared: Iterable[str] = ()) -> bool:
+def refuse(spared: Iterable[str] = (), *, uses_open_programs: bool = False) -> bool:
     """Refuse the calls of ``denied`` to all threads of this process; return False if the machine is unknown.
 
     The thread must have ``no_new_privs``, or CAP_SYS_ADMIN.
 
+    Args:
+        uses_open_programs: bpf(2) is allowed with the programs and maps that are open; it loads and makes none.
+
     Raises:
         OSError: the system refuses.
     """
-    refused = denied(platform.machine(), spared).values()
-    return _install([step for number in refused for step in _on(number, _REFUSE)], _ALLOW)
+    refused = denied(platform.machine(), spared)
+    number = refused.pop("bpf", None) if uses_open_programs else None
+    steps = [] if number is None else _on_command(number, _OF_OPEN, _FIRST_AT)
+    return _install([*steps, *(step for each in refused.values() for step in _on(each, _REFUSE))], _ALLOW)
 
 
 def allow_only_reading() -> bool:
@@ -132,7 +139,7 @@ def allow_only_reading() -> bool:
     steps = list[_Step]()
     for name, number in numbers.items():
         commands = _OF_COMMANDS[name][1] if name in _OF_COMMANDS else ()
-        steps += _on_command(number, commands) if commands else _on(number, _ALLOW)
+        steps += _on_command(number, commands, _SECOND_AT) if commands else _on(number, _ALLOW)
     known = max([*numbers.values(), *denied(platform.machine()).values()], default=0)
     steps += [(_AT_LEAST, 0, 1, known + 1), (_RETURN, 0, 0, _UNKNOWN)]
     return _install(steps, _REFUSE)
@@ -150,10 +157,10 @@ def _on(number: int, action: int) -> list[_Step]:
     return [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, action)]
 
 
-def _on_command(number: int, commands: Collection[int]) -> list[_Step]:
-    """Return what allows a call with some second arguments, of which the kernel uses 32 bits, and refuses others."""
+def _on_command(number: int, commands: Collection[int], at: int) -> list[_Step]:
+    """Return what allows a call with some values of an argument, of which 32 bits count, and refuses others."""
     rest = [step for each in commands for step in _on(each, _ALLOW)]
-    return [(_EQUAL, 0, len(rest) + 2, number), (_LOAD, 0, 0, _SECOND_AT), *rest, (_RETURN, 0, 0, _REFUSE)]
+    return [(_EQUAL, 0, len(rest) + 2, number), (_LOAD, 0, 0, at), *rest, (_RETURN, 0, 0, _REFUSE)]
 
 
 def _install(rules: Iterable[_Step], otherwise: int) -> bool:

@@ -21,7 +21,7 @@ from typing import Any, Final
 from gdp.control.keepalive import EARLY, JITTER, REPORT
 from gdp.errors import LocalError
 from gdp.frame.codec import ethernet
-from gdp.intervals import NEVER_S, SCHEDULED_S, UPKEEP_S
+from gdp.intervals import NEVER_S, SCHEDULED_S
 from gdp.ports.kernel.keepalive_program import (
     END_BYTES,
     FRAME_BYTES,
@@ -78,7 +78,7 @@ class KeepaliveSessions:
 
     Attributes:
         due_s: monotonic second of the next tick; infinity: there are no sessions.
-        has_news: a session may have come to its end, or reports are due.
+        has_news: a session may have come to its end.
 
     Raises:
         LocalError: the process lacks the right, or the kernel is too old.
@@ -92,7 +92,6 @@ class KeepaliveSessions:
         self._sessions: dict[tuple[int, bytes], _Session] = {}
         self._free = list(range(_SESSIONS_MAX))  # slots; the first ones are used first
         self._listed: list[int] = []  # slots that were sent for last
-        self._report_at_s = NEVER_S
         self._late_s = 0.0
         self._send_at_s, self._interval_s = NEVER_S, 0.0
         self.due_s = NEVER_S
@@ -179,9 +178,7 @@ class KeepaliveSessions:
         self._configure(session, mac)
         self._ends.put(end, _NUMBER.pack(slot))
         self._sessions[key] = session
-        now_s = time.monotonic()
-        self._report_at_s = min(self._report_at_s, now_s + UPKEEP_S)
-        self._plan(now_s)
+        self._arrange()
         return KeepaliveRun(offer.port, offer.name, offer.nonce, received=offer.received, heard_s=offer.heard_s)
 
     def _configure(self, session: _Session, mac: bytes) -> None:
@@ -198,7 +195,7 @@ class KeepaliveSessions:
         run = self._report(session)._replace(is_over=True)
         del self._sessions[key]
         heappush(self._free, session.slot)
-        self._plan(time.monotonic())
+        self._arrange()
         return run
 
     def _report(self, session: _Session) -> KeepaliveRun:
@@ -223,11 +220,11 @@ class KeepaliveSessions:
         if self._send_at_s <= now_s + self._interval_s * EARLY:
             until_s = now_s + self._interval_s / 2
             self._send([each for each in self._sessions.values() if each.send_at_s <= until_s], now_s)
-        self.has_news = self.has_news or now_s >= self._report_at_s
         self._plan(now_s)
 
     def _send(self, sessions: list[_Session], now_s: float) -> None:
-        slots, jitter = [each.slot for each in sessions], os.urandom(1)[0] * JITTER
+        slots, words = [each.slot for each in sessions], self._words
+        jitter = JITTER * (int(now_s * 1e6) & 255)  # of the moment of a wake-up, as good as random for this
         if slots != self._listed:
             self._listed = slots
             self._slots.put_many([_NUMBER.pack(at) for at in range(len(slots))], [*map(_NUMBER.pack, slots)])
@@ -238,36 +235,37 @@ class KeepaliveSessions:
             jitter = 1 - _AGAIN
         for session in sessions:
             session.send_at_s = now_s + session.offer.out_interval_s * (1 - jitter)
-            sent = self._words[session.slot * _WORDS + _COUNT_AT]
+            sent = words[session.slot * _WORDS + _COUNT_AT]
             if sent != session.sent:
                 session.sent_s.append(now_s)
                 session.sent = sent
 
+    def _arrange(self) -> None:
+        """Set the shortest interval after sessions have come or gone, and plan."""
+        self._interval_s = min([each.offer.out_interval_s for each in self._sessions.values()], default=0.0)
+        self._plan(time.monotonic())
+
     def _plan(self, now_s: float) -> None:
         """Set when the next tick is due: silence is looked at when keepalives leave, half an interval late at most."""
-        send_at_s = silent_at_s = interval_s = NEVER_S
-        for session in self._sessions.values():
-            offer = session.offer
-            silent_s = self._words[session.slot * _WORDS + _HEARD_AT] * 1e-9 + offer.suspect_s
-            send_at_s, silent_at_s = min(send_at_s, session.send_at_s), min(silent_at_s, silent_s)
-            interval_s = min(interval_s, offer.out_interval_s)
+        words, sessions = self._words, self._sessions.values()
+        heard = [words[each.slot * _WORDS + _HEARD_AT] * 1e-9 + each.offer.suspect_s for each in sessions]
+        silent_at_s = min(heard, default=NEVER_S)
+        send_at_s = min([each.send_at_s for each in sessions], default=NEVER_S)
         if silent_at_s <= now_s:
             self.has_news = True
-        self._send_at_s, self._interval_s = send_at_s, interval_s
-        self.due_s = min(send_at_s, silent_at_s + interval_s / 2)
+        self._send_at_s = send_at_s
+        self.due_s = min(send_at_s, silent_at_s + self._interval_s / 2)
 
-    def poll(self, now_s: float) -> tuple[list[KeepaliveRun], float]:
-        """Return what happened in sessions: those that end, and all when reports are due; and how late a tick was."""
+    def poll(self, now_s: float, *, reports: bool = False) -> tuple[list[KeepaliveRun], float]:
+        """Return what happened in sessions that end, and how late a tick was; with ``reports`` also in the others."""
         self.has_news, late_s, self._late_s = False, self._late_s, 0.0
-        is_due, runs = now_s >= self._report_at_s, list[KeepaliveRun]()
-        if is_due or not self._sessions:
-            self._report_at_s = now_s + UPKEEP_S if self._sessions else NEVER_S
+        runs = list[KeepaliveRun]()
         for key, session in list(self._sessions.items()):
             at = session.slot * _WORDS
             has_come = self._words[at + _UP_AT] or session.offer.port not in self._links
             if has_come or self._words[at + _HEARD_AT] * 1e-9 + session.offer.suspect_s <= now_s:
                 runs.append(self._end(key))
-            elif is_due:
+            elif reports:
                 runs.append(self._report(session))
         return runs, late_s
 

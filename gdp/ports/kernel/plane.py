@@ -12,23 +12,21 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from functools import partial
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
-from gdp.intervals import NEVER_S, RETRY_S, SoftState
+from gdp.intervals import RETRY_S, UPKEEP_S, SoftState
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT, PortFlag
 from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment, has_links
 from gdp.ports.kernel.device import TxDrops, peer_is_bare
-from gdp.ports.kernel.keepalives import KeepaliveSessions, open_sessions
+from gdp.ports.kernel.keepalive_plane import KeepalivePlane
+from gdp.ports.kernel.keepalives import open_sessions
 from gdp.ports.kernel.loaded_program import LoadedProgram
 from gdp.ports.kernel.map_sync import EntryCounts, MapSync
 from gdp.ports.netlink import TRAFFIC_GROUP, NetlinkSocket, Notifications
 from gdp.ports.plane import Counters, Port
-from gdp.ports.raw import RawPlane
-from gdp.ports.sockets import TrafficClass
 from gdp.sansio import ReceivedFrame
 from gdp.switch.table import Table
 
@@ -36,7 +34,7 @@ _COUNTED_MAX: Final = 100
 _FILTER: Final = SoftState(1.0, periods=3)  # the filter of a process that died forwards no longer than this
 
 
-class KernelPlane(RawPlane):
+class KernelPlane(KeepalivePlane):
     """``Plane`` with a program on the ingress of every port.
 
     Args:
@@ -71,10 +69,8 @@ class KernelPlane(RawPlane):
             self._questions = opened.enter_context(closing(NetlinkSocket()))
             self._queues = opened.enter_context(closing(Notifications(TRAFFIC_GROUP)))
             self._mirror = MapSync(table, *self._loaded.of_entries)
-            self._sessions = None if self._loaded.is_leased else open_sessions()
-            if self._sessions is not None:
-                opened.enter_context(closing(self._sessions))
-            super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
+            sessions = None if self._loaded.is_leased else open_sessions()
+            super().__init__(ifnames, table, sessions=sessions, bypass_qdisc=bypass_qdisc)
             opened.pop_all()  # from now on ``close`` closes them
         self.watch(self._queues, self._review_queues)
         if table is not None:
@@ -86,7 +82,7 @@ class KernelPlane(RawPlane):
         """The present counts of the kernel and of this process together.
 
         A device does not report that it refused a redirected frame. Such a frame counts as forwarded, and as
-        ``PORT_FULL`` after the next query of the devices. ``poll`` makes it twice a second while frames are forwarded.
+        ``PORT_FULL`` after the next query of the devices. ``poll`` makes it each second while frames are forwarded.
         """
         here, there = self._counters, self._loaded.counters()
         drops = [a + b for a, b in zip(here.drops, there.drops, strict=True)]
@@ -122,36 +118,13 @@ class KernelPlane(RawPlane):
             timeout_s = _FILTER.refresh_s if timeout_s is None else min(timeout_s, _FILTER.refresh_s)
         if time.monotonic() >= self._next_upkeep_s:
             self._keep_up()
-        if self._sessions is None or self._sessions.due_s == NEVER_S:
-            return super().poll(timeout_s)
-        return self._poll_and_tick(self._sessions, timeout_s)
-
-    def _poll_and_tick(self, sessions: KeepaliveSessions, timeout_s: float | None) -> Sequence[ReceivedFrame]:
-        """Poll; send the keepalives that are due. The wait ends early with them, if it would before the next ones."""
-        now_s = time.monotonic()
-        until_s = NEVER_S if timeout_s is None else now_s + timeout_s
-        is_awake = sessions.has_news
-        while True:
-            if now_s >= sessions.due_s:
-                sessions.tick(now_s)
-                is_awake = sessions.has_news or sessions.due_s >= until_s
-            arrivals = super().poll(0.0 if is_awake else max(min(until_s, sessions.due_s) - now_s, 0.0))
-            now_s = time.monotonic()
-            if arrivals or is_awake or not self._is_idle or sessions.has_news or now_s >= until_s:
-                return arrivals
-
-    @property
-    def keepalives(self) -> KeepaliveSessions | None:
-        """Return the keepalive sessions that the kernel runs, as ``Plane.keepalives``."""
-        return self._sessions
+        return super().poll(timeout_s)
 
     def close(self) -> None:
         """Detach the programs and close every socket and map."""
         if self._table is not None:
             self._table.observe(None)
         super().close()
-        if self._sessions is not None:
-            self._sessions.close()
         self._queues.close()
         self._questions.close()
         self._loaded.close()
@@ -172,29 +145,14 @@ class KernelPlane(RawPlane):
         except LocalError as error:
             self._shut(port)
             raise LocalError(f"port {port.ifname}: {error}") from error
-        if self._sessions is not None:
-            self._sessions.attach(port.index, port.ifname)  # behind the forwarder, which passes on what is for us
-
-    def _open_traffic_class(self, port: Port, traffic_class: TrafficClass, rank: int) -> None:
-        super()._open_traffic_class(port, traffic_class, rank)
-        if traffic_class is TrafficClass.CONTROL and self._sessions is not None:
-            fd = self._sockets_by_class[traffic_class][port.index].fileno()
-            self._ready[fd] = partial(self._take_control, self._sessions, self._ready[fd])
-
-    def _take_control(self, sessions: KeepaliveSessions, ready: Callable[[], None]) -> None:
-        """Receive control frames; the kernel may have passed a keepalive up, which ends a session that it runs."""
-        sessions.has_news = True
-        ready()
 
     def _shut(self, port: Port) -> None:
         self._loaded.set_port(port.index, 0, 0, 0)
         attachment = self._attachments.pop(port.index, None)
-        links = [] if self._sessions is None else self._sessions.detach(port.index)
         if isinstance(attachment, LinkAttachment):
-            links.insert(0, attachment.close)  # which forwards
+            self._closing.close(port.ifname, [attachment.close])
         elif attachment is not None:
             attachment.close()
-        self._closing.close(port.ifname, links)
         super()._shut(port)
 
     def _know(self, port: Port) -> None:
@@ -237,7 +195,7 @@ class KernelPlane(RawPlane):
         """Do what no notification triggers: renew the lease, check each port's egress, and read refusals."""
         self._loaded.renew(_FILTER.lease_s)
         now_s, forwarded = time.monotonic(), self._loaded.counters().forwarded
-        self._next_upkeep_s = now_s + _FILTER.refresh_s / 2
+        self._next_upkeep_s = now_s + (_FILTER.refresh_s / 2 if self._loaded.is_leased else UPKEEP_S)
         if forwarded == self._forwarded and now_s < self._next_look_s:
             return  # no device had to send
         self._forwarded, self._next_look_s = forwarded, now_s + RETRY_S

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.config.offered_qos import OFFERED_DEPTH_MAX
+from gdp.intervals import NEVER_S
 from proxy.serial.channel import NEVER, Channel, Qos
 
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one publisher
@@ -63,7 +64,7 @@ def joint(channel: Channel) -> Qos:
     latched = [each for each in channel.qos if channel.latched and each.durability == "transient_local"]
     if not channel.qos:
         return default(latched=channel.latched)
-    profile = request(channel.qos)
+    profile = replace(request(channel.qos), deadline=_longest(channel.qos))
     return replace(profile, durability="transient_local", depth=max(map(depth_of, latched))) if latched else profile
 
 
@@ -90,13 +91,23 @@ def shared_depth(messages: int) -> int:
 
 
 def offer(
-    sources: Sequence[Qos], wants: Sequence[Qos], *, is_latched: bool | None, is_reliable: bool | None = None
+    sources: Sequence[Qos],
+    wants: Sequence[Qos],
+    *,
+    is_latched: bool | None,
+    is_reliable: bool | None = None,
+    is_known: bool = True,
 ) -> Qos:
     """Return the profile to offer: that of the known remote publishers, and more where a local reader requires it.
 
+    A reader that requests a deadline is offered it, unless one of them has a longer one, or none. The middleware here
+    then tells it that no message came.
+
     Args:
+        sources: of the remote publishers, or as the rule states them.
         is_latched: the rule's value; None: unset.
         is_reliable: likewise; it holds until a remote publisher is known.
+        is_known: whether the sources are publishers.
     """
     latched = [each for each in sources if each.durability == "transient_local"]
     insisting = [each for each in wants if each.durability == "transient_local"]
@@ -105,11 +116,20 @@ def offer(
     if len(latched) > 1:
         depth = shared_depth(sum(map(depth_of, latched)))
     is_reliable = any(each.reliability != "best_effort" for each in sources) if sources else is_reliable is not False
-    return default(
+    profile = default(
         reliable=is_reliable or any(each.reliability == "reliable" for each in wants),
         latched=is_latched or bool(insisting),
         depth=min(max(depth, 1), OFFERED_DEPTH_MAX),
     )
+    deadlines = [each.deadline for each in wants if _seconds(each.deadline)]
+    return (
+        replace(profile, deadline=max(min(deadlines), _longest(sources if is_known else ()))) if deadlines else profile
+    )
+
+
+def _longest(offers: Sequence[Qos]) -> tuple[int, int]:
+    """Return the longest deadline of publishers; ``NEVER``: one states none; zero: there are no publishers."""
+    return max((each.deadline if _seconds(each.deadline) else NEVER for each in offers), default=(0, 0))
 
 
 def _seconds(duration: tuple[int, int]) -> float | None:
@@ -119,12 +139,16 @@ def _seconds(duration: tuple[int, int]) -> float | None:
     return duration[0] + duration[1] / 1e9
 
 
-def unmatched(want: Qos) -> str:
-    """Return the policy of a local reader that cannot be met across a network, empty where there is none."""
-    if want.deadline not in (NEVER, (0, 0)):
-        return "it requests a deadline"
+def unmatched(want: Qos, offered: Qos | None = None) -> str:
+    """Return the policy of a local reader that is not met, empty where there is none.
+
+    Args:
+        offered: what the known remote publishers fulfil; None: none is known, and a deadline may yet be met.
+    """
+    if offered is not None and (_seconds(want.deadline) or NEVER_S) < (_seconds(offered.deadline) or NEVER_S):
+        return "it requests a deadline, and the far publishers offer none, or a longer one"
     if want.liveliness not in ("automatic", "system_default", "unknown", "best_available"):
-        return f"it requests liveliness {want.liveliness}"
+        return f"it requests liveliness {want.liveliness}, which no network can promise"
     if want.lease not in (NEVER, (0, 0)):
-        return "it requests a liveliness lease"
+        return "it requests a liveliness lease, which no network can promise"
     return ""

@@ -23,6 +23,7 @@ from thin_link.conditions import FRAME_BYTES, Conditions
 ROBOT: Final = "s1"
 CLOUD: Final = "s2"
 LINE: Final = "line"
+TCP_CONTROL: Final = "cubic"  # a machine's own default may differ from Linux's
 ADDRESSES: Final = {ROBOT: "10.99.0.1", CLOUD: "10.99.0.2"}
 _INSIDE: Final = (("a", ROBOT), (ROBOT, LINE), (LINE, CLOUD), (CLOUD, "b"))
 _READY_S: Final = 10.0
@@ -66,10 +67,9 @@ class Line:
         return self._process.ask(report=True, **order)
 
 
-def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
+def thin_link_lab(run: Run) -> Lab:
     """Make the machines ``a - s1 - line - s2 - b``: programs and switch of the robot, the link, those of the cloud.
 
-    ``tcp_control``: congestion control of TCP at robot and cloud; a machine's own default may differ from Linux's.
     Raises ``LocalError``: the kernel refuses. Raises ``FailedError``: it has no such congestion control.
     """
     topology = flat_topology(
@@ -78,7 +78,7 @@ def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
     lab = Lab(run, topology)
     for node, address in ADDRESSES.items():
         lab.namespaces[node].configure([f"addr add {address}/24 dev {LINE}"])
-        _set_tcp_control(lab, node, tcp_control)
+        _set_tcp_control(lab, node)
         lab.inside(node, partial(clear_offloads, LINE))
         lab.inside(LINE, partial(clear_offloads, node))
     macs = {node: lab.inside(node, partial(mac_addresses, [LINE]))[LINE] for node in ADDRESSES}
@@ -88,12 +88,12 @@ def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
     return lab
 
 
-def _set_tcp_control(lab: Lab, node: str, name: str) -> None:
+def _set_tcp_control(lab: Lab, node: str) -> None:
     """Set the congestion control on the route: only a route may name one that the first namespace does not offer all.
 
     Source: Linux, net/ipv4/tcp_cong.c, ``tcp_set_default_congestion_control``.
     """
-    route = f"10.99.0.0/24 dev {LINE} proto kernel scope link src {ADDRESSES[node]} congctl {name}"
+    route = f"10.99.0.0/24 dev {LINE} proto kernel scope link src {ADDRESSES[node]} congctl {TCP_CONTROL}"
     lab.machines[node].output("ip", "route", "replace", *route.split())
 
 

@@ -104,12 +104,6 @@ class NumberedFlow:
                 continue
             arrivals.append((time.monotonic(), _NUMBER.unpack_from(message.payload)[0]))
 
-    def delays_ms(self, from_s: float, to_s: float) -> list[float]:
-        """Return the delay of each message that was published in an interval; an absent one has that until now."""
-        now_s, sent = time.monotonic(), list(self.sent_s)
-        came = {number: at_s for at_s, number in reversed(list(self.arrivals[0]))}
-        return [(came.get(number, now_s) - at_s) * 1e3 for number, at_s in enumerate(sent) if from_s <= at_s < to_s]
-
     def silence_ms(self, from_s: float, to_s: float) -> float:
         """Return the longest time between two arrivals at a reader in an interval, its ends included."""
         marks = [[from_s, *(at_s for at_s, _ in list(each) if from_s <= at_s < to_s), to_s] for each in self.arrivals]

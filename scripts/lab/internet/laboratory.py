@@ -86,12 +86,6 @@ class Laboratory(ClosedOnExit):
         """Return an IPv6 prefix that no site had before."""
         return next(self._prefixes)
 
-    def renew_leases(self, site: Site) -> None:
-        """Give each host of a site the addresses that the site has for it now."""
-        for host in self.hosts.values():
-            for device in host.devices_at(site):
-                host.renew_lease(device)
-
     def set_ports(self, site: Site, *, is_up: bool) -> None:
         """Give the carrier to every host of a site, or take it away."""
         for host in self.hosts.values():

@@ -143,7 +143,9 @@ class Site:
         self._configure()
         if self._is_nat:
             self._outer.flush_connections()  # packets that came in between have a mapping to an inner address
-        self._laboratory.renew_leases(self)
+        for host in self._laboratory.hosts.values():
+            for device in host.devices_at(self):
+                host.renew_lease(device)
 
     def cut(self) -> None:
         """Let all packets of the uplink vanish."""

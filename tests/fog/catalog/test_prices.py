@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import pytest
 
-import make_catalog
 from fog.catalog.measured import measured
 from fog.catalog.prices import aws_prices, price_list, regions_of
 from fog.hardware import Hardware
@@ -49,9 +45,3 @@ def test_pairs_of_one_region_go_together_more_often_than_independent_ones() -> N
     low, high = measured().factors
     assert (low, high) == (1.63, 3.69)
     assert measured().uptime_s < measured().back_s
-
-
-def test_the_shipped_data_are_what_the_script_makes() -> None:
-    folder = Path(make_catalog.__file__).parent.parent / "fog/catalog"
-    for name, made in (("aws.json", make_catalog.prices()), ("traces.json", make_catalog.traces())):
-        assert json.loads((folder / name).read_text()) == json.loads(json.dumps(made))

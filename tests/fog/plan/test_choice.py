@@ -7,7 +7,6 @@ import pytest
 from fog.cluster import MachineRequest
 from fog.hardware import Hardware, Offer
 from fog.plan.choice import Weights, choose
-from fog.plan.cost import compared
 from gdp.errors import LocalError
 
 
@@ -77,9 +76,3 @@ def test_where_nothing_fits_the_nearest_is_named(wanted: MachineRequest, said: s
 def test_another_gpu_is_nearer_than_none() -> None:
     with pytest.raises(LocalError, match="type4T4"):
         choose([*LIST, offer("east", 0.5, gpu="T4")], [MachineRequest(Hardware(4, gpu="A100", gpus=1), is_spot=True)])
-
-
-def test_two_spot_machines_are_compared_with_one_on_demand() -> None:
-    one, two, spots = compared(offer("east", 1.0, spot=False), offer("east", 0.2))
-    assert (one.usd_per_hour, two.usd_per_hour, spots.usd_per_hour) == (1.0, 2.0, 0.4)
-    assert (two.of_single, spots.of_single, one.usd_per_month) == (2.0, 0.4, 730.0)

@@ -83,3 +83,13 @@ def test_a_short_command_loads_nothing_of_a_node(program: str, words: list[str])
 @pytest.mark.parametrize("command", [rib, proxy])
 def test_a_node_that_starts_with_its_switch_waits_for_the_device(command: Callable[..., None]) -> None:
     assert inspect.signature(command).parameters["await_iface"].default >= 10
+
+
+@pytest.mark.parametrize("words", [["topic", "--help"], ["topic", "list", "--help"], ["--version"]])
+def test_a_help_text_loads_nothing_that_asks_nodes(words: list[str]) -> None:
+    code = (
+        f"import atexit, sys\natexit.register(lambda: print(*sys.modules))\nfrom gdp.cli.gdp import main\nmain({words})"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stdout
+    assert "gdp.cli.gdp" in said
+    assert {"gdp.management.control_socket", "gdp.state.control_protocol"} & set(said.split()) == set()

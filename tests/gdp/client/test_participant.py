@@ -13,7 +13,7 @@ from gdp.frame.codec import Flag, Header, Kind, encode
 from gdp.sansio import ReceivedFrame
 from gdp.trust.right import Right
 from lab.simulation import Simulation
-from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
+from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, advertise, flowing, row
 
 ROUNDS = 600
 
@@ -25,7 +25,7 @@ def again(flow: Flow, *, reliable: bool = True, depth: int = 0, description: byt
 
 
 def test_a_topic_advertised_again_goes_on_above_all_numbers() -> None:
-    flow = flowing(ring())
+    flow = flowing(row())
     flow.publish(b"first")
     assert flow.world.network.run(1, lambda: flow.has(SERVER, 1))
     flow.member.withdraw(flow.topic.name)
@@ -38,7 +38,7 @@ def test_a_topic_advertised_again_goes_on_above_all_numbers() -> None:
 
 
 def test_a_topic_may_come_back_as_something_else() -> None:
-    flow = flowing(ring())
+    flow = flowing(row())
     flow.publish(b"reliable")
     assert flow.world.network.run(1, lambda: flow.has(SERVER, 1))
     flow.member.withdraw(flow.topic.name)
@@ -56,7 +56,7 @@ def test_a_topic_may_come_back_as_something_else() -> None:
 
 
 def test_messages_of_a_withdrawn_name_reach_no_reader() -> None:
-    flow = flowing(ring())
+    flow = flowing(row())
     flow.member.withdraw(flow.topic.name)
     flow.member.withdraw(flow.topic.name)
     assert flow.publisher.publish(b"too late") is None
@@ -66,7 +66,7 @@ def test_messages_of_a_withdrawn_name_reach_no_reader() -> None:
 
 
 def test_withdrawing_does_not_end_reading_the_same_name() -> None:
-    world = ring()
+    world = row()
     flow = flowing(world)
     reader = world.members[SERVER]
     both = world.topic(flow.name, reader, [Right.PUBLISH, Right.READ])
@@ -84,7 +84,7 @@ def test_withdrawing_does_not_end_reading_the_same_name() -> None:
 
 
 def test_a_topic_is_read_again_from_what_is_new_then_and_replays_are_refused() -> None:
-    flow = flowing(ring())
+    flow = flowing(row())
     network, reader = flow.world.network, flow.world.members[SERVER]
     tap = Tap("nuc5", SERVER)
     network.taps.append(tap)
@@ -109,7 +109,7 @@ def test_a_topic_is_read_again_from_what_is_new_then_and_replays_are_refused() -
 
 
 def test_the_last_messages_of_a_latched_topic_come_again_to_who_reads_it_again() -> None:
-    flow = advertise(ring(), depth=1)
+    flow = advertise(row(), depth=1)
     flow.read_by(SERVER)
     assert flow.world.network.run(5, lambda: flow.is_read_by(1))
     flow.publish(b"the map")
@@ -124,7 +124,7 @@ def test_the_last_messages_of_a_latched_topic_come_again_to_who_reads_it_again()
 
 
 def test_who_reads_before_its_first_event_has_waited_since_then() -> None:
-    world = ring()
+    world = row()
     member = world.restart_member(SERVER)
     topic = world.topic("/chatter", member, [Right.READ])
     member.subscribe(topic)
@@ -134,14 +134,14 @@ def test_who_reads_before_its_first_event_has_waited_since_then() -> None:
 
 
 def test_a_topic_is_read_once_at_a_time() -> None:
-    flow = flowing(ring())
+    flow = flowing(row())
     reader = flow.world.members[SERVER]
     with pytest.raises(LocalError, match="in use"):
         reader.subscribe(flow.world.topic(flow.name, reader, [Right.READ]))
 
 
 def test_a_new_description_reaches_who_reads_already_though_frames_are_lost() -> None:
-    flow = flowing(ring())
+    flow = flowing(row())
     network, reader = flow.world.network, flow.world.members[SERVER]
     (writer_proxy,) = reader.subscriptions.writer_proxies_of(flow.topic.name)
     assert network.run(1, lambda: writer_proxy.description == b"described")
@@ -159,8 +159,8 @@ def test_a_new_description_reaches_who_reads_already_though_frames_are_lost() ->
 @pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1), (0, 2), (2, 0)])
 @pytest.mark.parametrize("reliable", [True, False])
 def test_late_joiners_get_as_many_messages_as_the_depth_is_now(before: int, after: int, *, reliable: bool) -> None:
-    world = ring()
-    world.add_member("nuc4/other", "nuc4")
+    world = row()
+    world.add_member("nuc2/other", "nuc2")
     assert world.run_until_attached()
     flow = advertise(world, reliable=reliable, depth=before)
     flow.read_by(SERVER)
@@ -171,12 +171,12 @@ def test_late_joiners_get_as_many_messages_as_the_depth_is_now(before: int, afte
         flow.publish(b"%d" % number)
         world.network.run(0.1)
     assert flow.has(SERVER, 7)
-    flow.read_by("nuc4/other")
+    flow.read_by("nuc2/other")
     assert world.network.run(5, lambda: flow.is_read_by(2))
     world.network.run(1)
     flow.publish(b"last")
-    assert world.network.run(1, lambda: flow.has("nuc4/other", after + 1))
-    late = [each.message for each in flow.got["nuc4/other"]]
+    assert world.network.run(1, lambda: flow.has("nuc2/other", after + 1))
+    late = [each.message for each in flow.got["nuc2/other"]]
     assert late == [b"%d" % number for number in range(7 - after, 7)] + [b"last"]
     assert world.network.run(1, lambda: flow.has(SERVER, 8))
 
@@ -192,7 +192,7 @@ def sizes(world: Simulation) -> list[int]:
 
 
 def test_send_options_reach_the_publisher_of_a_topic() -> None:
-    world = ring()
+    world = row()
     member = world.members[ROBOT]
     options = SendOptions(deadline_s=0.2, weight=3, max_bits_s=1e6, repairs=False)
     topic = world.topic("/camera", member, [Right.PUBLISH])
@@ -201,7 +201,7 @@ def test_send_options_reach_the_publisher_of_a_topic() -> None:
 
 @pytest.mark.parametrize("right", [Right.SERVE, Right.CALL])
 def test_send_options_reach_the_stream_of_a_service(right: Right) -> None:
-    world = ring()
+    world = row()
     member = world.members[ROBOT]
     options = SendOptions(weight=3, max_bits_s=1e6)
     topic = world.topic("/plan", member, [right], kind="service")
@@ -238,7 +238,7 @@ def rounds(world: Simulation, member: Participant, times: int) -> None:
 
 
 def test_hundreds_of_appearances_and_disappearances_leave_nothing_behind() -> None:
-    world = ring()
+    world = row()
     flow = advertise(world, source=SERVER)
     member = world.members[ROBOT]
     rounds(world, member, ROUNDS // 20)
@@ -250,7 +250,7 @@ def test_hundreds_of_appearances_and_disappearances_leave_nothing_behind() -> No
 
 
 def test_each_frame_of_an_unknown_kind_is_dropped_and_counted_once() -> None:
-    world = ring()
+    world = row()
     member = world.members[ROBOT]
     switch = member.attachment.switch
     assert switch is not None

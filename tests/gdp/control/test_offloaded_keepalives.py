@@ -7,13 +7,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import pytest
+
 from gdp.control.keepalive import keepalive_header, open_keepalive, seal_keepalive
 from gdp.control.link_quality import LinkReport
+from gdp.crypto.statements import parse
 from gdp.errors import DropReason, FrameError
 from gdp.frame.codec import HEADER_BYTES, KeepaliveFlag, Kind, decode
 from gdp.sansio import KeepaliveOffer, KeepaliveRun
-from tests.gdp.control.members import UNIX_S, at
-from tests.gdp.control.test_keepalive import DETECT_S, STEP_S, A, Pair, up
+from gdp.trust.domain import Policy
+from gdp.trust.revocation import Revocation
+from gdp.trust.revocations import OPERATOR
+from tests.gdp.control.members import SCHOOL, UNIX_S, YEAR, at
+from tests.gdp.control.test_keepalive import DETECT_S, FAST, STEP_S, A, Pair, up
 
 
 @dataclass
@@ -186,6 +192,37 @@ def test_what_the_data_plane_refused_is_counted() -> None:
     assert pair.session is not None
     pair._report(is_over=False)
     assert pair.ends["a"].drops[DropReason.REPLAYED] == 1
+
+
+@pytest.mark.parametrize("is_offloaded", [True, False])
+def test_what_a_revoked_neighbour_has_just_sent_does_not_keep_it(
+    monkeypatch: pytest.MonkeyPatch, *, is_offloaded: bool
+) -> None:
+    policy = Policy(SCHOOL.root)
+    monkeypatch.setattr("tests.gdp.control.test_keepalive.POLICY", policy)
+    pair = running()
+    end, session = pair.ends["a"], pair.session
+    assert session is not None
+    (neighbour,) = end.neighbours.all_up()
+    assert neighbour.member is not None
+    issuer, fingerprint = SCHOOL.root.subject, neighbour.member.fingerprint
+    if not is_offloaded:
+        pair._report(is_over=True)
+    now = at(pair.now_s, UNIX_S + pair.now_s)
+    neighbour.checked_s = pair.now_s
+    wire = Revocation.make(SCHOOL.key, issuer, fingerprint, YEAR.not_after_unix_s)
+    policy.revoked.receive_revocation(parse(wire), OPERATOR, now, lambda _: True)
+    end.recheck(fingerprint, now)
+    if is_offloaded:
+        session.taken, session.heard_s = session.taken + 1, pair.now_s
+        pair._report(is_over=False)
+    else:
+        pair.now_s += FAST.transmit_ms / 1e3
+        frames = [frame for out in pair.ends["b"].hellos_to_send(pair.now_s) for frame in out.frames]
+        (keepalive,) = [frame for frame in frames if decode(frame).kind == Kind.KEEPALIVE]
+        pair.hear("a", keepalive)
+        assert pair.refused == []
+    assert [change[0].name for change in end.drop_silent(pair.now_s)] == [neighbour.name]
 
 
 def test_a_recording_of_a_session_that_ended_while_a_data_plane_ran_it_brings_no_life() -> None:

@@ -6,6 +6,8 @@ import time
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
+
 from gdp.ports.plane import Plane
 from gdp.runtime.runtime import Runtime
 from gdp.sansio import NodeCore, ReceivedFrame, Timestamps
@@ -87,16 +89,35 @@ def test_a_period_without_work_wakes_no_loop_and_its_function_is_called_once_the
     assert work == []
 
 
-def test_periods_wait_for_a_quarter_of_them_until_something_else_wakes_the_loop_and_are_kept_on_average() -> None:
+def test_periods_are_up_to_a_quarter_early_or_late_with_what_wakes_the_loop_and_are_kept_on_average() -> None:
     runtime, _ = loop(0)
     called: list[float] = []
     runtime.every(0.5, lambda moment: called.append(moment.mono_s))
     (each,) = runtime._periodic
     each.handle(Timestamps(100.0, 0.0))
-    each.handle(Timestamps(100.3, 0.0))
+    each.handle(Timestamps(100.2, 0.0))
     due_s, until_s = each.due_s, runtime.next_due_s()
     assert until_s == due_s + 0.125
-    for now_s in (due_s - 0.01, due_s + 0.06, due_s + 0.4):
+    for now_s in (due_s - 0.13, due_s + 0.06, due_s + 0.3):
         each.handle(Timestamps(now_s, 0.0))
     assert called == [100.0, due_s + 0.06]
     assert each.due_s == due_s + 0.5
+    each.handle(Timestamps(due_s + 0.4, 0.0))
+    assert called[2:] == [due_s + 0.4]
+    assert each.due_s == due_s + 1.0
+
+
+def test_functions_of_several_periods_and_phases_share_their_wake_ups() -> None:
+    runtime, _ = loop(0)
+    calls: list[float] = []
+    for period_s in (0.5, 1.0, 1.0):
+        runtime.every(period_s, lambda _: calls.append(0.0))
+    for each, begun_s in zip(runtime._periodic, (100.0, 100.13, 100.41), strict=True):
+        each.handle(Timestamps(begun_s, 0.0))
+    wakes = 0
+    while (until_s := runtime.next_due_s()) is not None and until_s < 160.0:
+        wakes += 1
+        for each in runtime._periodic:
+            each.handle(Timestamps(until_s, 0.0))
+    assert len(calls) == pytest.approx(60 * 4, abs=6)
+    assert wakes <= 60 / 0.5 + 4

@@ -14,7 +14,7 @@ from gdp.sansio import ReceivedFrame, Timestamps
 from gdp.switch.table import NOWHERE
 from gdp.switch.unicast import _Installed
 from lab.simulation import Simulation
-from tests.journeys.flows import ROBOT, SERVER, flowing, ring
+from tests.journeys.flows import ROBOT, SERVER, flowing, row
 from tests.visited import visited
 
 ABSENT = Name(b"?" * 32)
@@ -30,7 +30,7 @@ def send(world: Simulation, destination: Name, source: str = ROBOT, kind: int = 
 
 
 def test_an_unadvertised_name_is_answered_and_then_dropped_by_the_data_plane() -> None:
-    world = ring()
+    world = row()
     robot, nuc1 = world.members[ROBOT].name, world.switches["nuc1"]
     send(world, ABSENT)
     assert len(nuc1.resolver.pending) == 0
@@ -43,14 +43,14 @@ def test_an_unadvertised_name_is_answered_and_then_dropped_by_the_data_plane() -
 
 
 def test_a_frame_waits_while_its_destination_is_asked_for() -> None:
-    world = ring()
+    world = row()
     send(world, ABSENT)
     world.network.run(0.0005)
     assert len(world.switches["nuc1"].resolver.pending) == 1
 
 
 def test_who_attaches_where_it_was_missed_is_reached_at_once() -> None:
-    world = ring()
+    world = row()
     nuc1 = world.switches["nuc1"]
     late = world.add_member("nuc1/late", "nuc1")
     for _ in range(3):
@@ -64,7 +64,7 @@ def test_who_attaches_where_it_was_missed_is_reached_at_once() -> None:
 
 
 def test_who_is_found_is_reached_though_it_was_missed_a_moment_ago() -> None:
-    world = ring()
+    world = row()
     nuc1, robot = world.switches["nuc1"], world.members[ROBOT].name
     server = world.members[SERVER].name
     nuc1.unicast._install_negative(server, robot, DropReason.NO_ROUTE, world.network.now.mono_s)
@@ -78,7 +78,7 @@ def test_who_is_found_is_reached_though_it_was_missed_a_moment_ago() -> None:
 
 
 def test_no_change_of_links_takes_down_a_tree_that_grew_where_nothing_was_read() -> None:
-    world = ring()
+    world = row()
     flow = flowing(world)
     nuc1, robot = world.switches["nuc1"], world.members[ROBOT].name
     key = flow.topic.name + robot
@@ -92,7 +92,7 @@ def test_no_change_of_links_takes_down_a_tree_that_grew_where_nothing_was_read()
 
 
 def test_what_is_remembered_of_entries_goes_with_them() -> None:
-    world = ring()
+    world = row()
     nuc1 = world.switches["nuc1"]
     for _ in range(2):
         for number in range(200):
@@ -106,7 +106,7 @@ def test_what_is_remembered_of_entries_goes_with_them() -> None:
 
 
 def test_a_frame_that_misses_visits_few_files_until_it_is_released() -> None:
-    world = ring()
+    world = row()
     nuc1, server, seen = world.switches["nuc1"], world.members[SERVER].name, set[str]()
     receive, send_queries = nuc1.receive, nuc1.rib_client.send_queries
 
@@ -130,7 +130,7 @@ def test_a_frame_that_misses_visits_few_files_until_it_is_released() -> None:
 
 
 def test_a_frame_enters_once_and_its_path_is_resolved_once_for_all_that_wait_for_it() -> None:
-    world = ring()
+    world = row()
     nuc1, robot, server = world.switches["nuc1"], world.members[ROBOT].name, world.members[SERVER].name
     unicast = nuc1.unicast
     with (

@@ -10,22 +10,25 @@ from typing import Final, cast
 
 import pytest
 
-from gdp.control.diagnostics import Reply
+from gdp.control.diagnostics import Question, Reply
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason
 from gdp.message.clock_offset import ClockEstimate
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ports.plane import Plane
+from gdp.sansio import Timestamps
 from gdp.state.snapshot import short_id
 from gdp.telemetry.sources import Sources
 from gdp.trust.right import Right
-from proxy.bridge import imported_topic
+from proxy.bridge import control_services, imported_topic
+from proxy.bridge.cancellation import NO_FIELDS
 from proxy.bridge.flow_rows import flow_fields
 from proxy.bridge.liveliness import names_from_fields
 from proxy.node.control_answer import answer_control
 from proxy.node.proxy_state import ProxyState, proxy_handlers
-from tests.proxy.bridge.known import channel, channels, services
+from tests.proxy.bridge.clients import Client
+from tests.proxy.bridge.known import channel, channels, services, text_of
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Sites, named
 from tests.proxy.endpoints.fake import FakeGraph, Publication
 
@@ -54,7 +57,8 @@ class Drive:
 
     def __init__(self, sites: Sites, rule: str) -> None:
         self.sites = sites
-        self.desks = {label: sites.add(label, expose=[DRIVE], graph=graph()) for label in (SERVER, OTHER)}
+        steer = f"{DRIVE}, control: exclusive"
+        self.desks = {label: sites.add(label, expose=[steer], graph=graph()) for label in (SERVER, OTHER)}
         self.robot = sites.add(ROBOT, imports=[f"{DRIVE}, {rule}"], graph=graph())
         self.ear = Ear(self.robot.graph, "/cmd_vel", TWIST)
         self.sticks: dict[str, Publication] = {}
@@ -117,6 +121,16 @@ class Drive:
         """Publish at a desk for a while, and let everything arrive."""
         self.sites.every(1 / HZ, round(duration_s * HZ), lambda _: self.sticks[label].publish(twist(speed)))
         self.sites.run(duration_s)
+
+    def call(self, label: str, act: str) -> tuple[bool, str]:
+        """Return what a local service of a machine answers."""
+        machine = self.robot if label == ROBOT else self.desks[label]
+        client = Client(machine.graph, f"/cmd_vel/control/{act}")
+        client.call(NO_FIELDS[2])
+        assert self.sites.run(5, lambda: bool(client.got[0]))
+        (raw,) = client.got[0]
+        assert isinstance(raw, bytes), raw
+        return raw[4] == 1, text_of(raw[4:])
 
     def drops(self, reason: DropReason) -> int:
         return self.robot.member.drops().get(reason, 0)
@@ -319,3 +333,77 @@ def test_holder_and_refused_messages_are_shown(drive: Drive) -> None:
     assert cast(int, row["refused"]) >= 5
     (flow,) = (flow_fields(*each) for each in drive.robot.bridge.flows)
     assert flow["holder"] == short_id(holder)
+
+
+@pytest.fixture
+def clocked(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> Drive:
+    """Return the machines, whose proxies state the time of the simulation."""
+    clock = SimpleNamespace(time_ns=drive.now_ns, time=lambda: drive.now_ns() / 1e9)
+    monkeypatch.setattr(control_services, "time", clock)
+    return drive
+
+
+def test_local_nodes_take_give_and_look_at_control_by_services(clocked: Drive) -> None:
+    robot, first, second = label_of(ROBOT), label_of(SERVER), label_of(OTHER)
+    assert clocked.call(SERVER, "show") == (False, f"{robot}: free")
+    assert clocked.call(SERVER, "take") == (True, f"{robot}: held by {first}")
+    clocked.drive(SERVER, 1.0)
+    assert set(clocked.speeds) == {1.0}
+    assert clocked.call(SERVER, "show") == (True, f"{robot}: held by {first}")
+    is_taken, text = clocked.call(OTHER, "take")
+    assert (is_taken, clocked.holder) == (False, clocked.desks[SERVER].member.name)
+    assert text.startswith(f"{robot}: another publisher holds control")
+    is_given, text = clocked.call(OTHER, "give")
+    assert (is_given, "only who holds control" in text) == (False, True)
+    assert clocked.call(SERVER, "give") == (True, f"{robot}: free")
+    assert clocked.sites.run(0.1, lambda: clocked.speeds[-1] == STOP)
+    assert clocked.call(OTHER, "take") == (True, f"{robot}: held by {second}")
+
+
+def test_a_node_at_the_robot_takes_control_from_everybody(clocked: Drive) -> None:
+    clocked.call(SERVER, "take")
+    clocked.drive(SERVER, 1.0)
+    assert clocked.call(ROBOT, "give") == (True, f"{label_of(ROBOT)}: free")
+    assert clocked.sites.run(0.1, lambda: clocked.speeds[-1] == STOP)
+
+
+def test_who_lost_the_right_to_publish_takes_nothing_by_a_service(clocked: Drive) -> None:
+    world, topic = clocked.sites.world, clocked.desks[SERVER].bridge.held.find(clocked.name, Right.PUBLISH)
+    assert topic is not None
+    fingerprint = parse(topic.delegation.chain[-1]).fingerprint
+    wire = world.owner.revoke(topic.delegation.subject, fingerprint, int(world.network.now.unix_s) + 100_000)
+    world.switches["nuc3"].revoke(wire, world.network.now)
+    world.network.send_pending("nuc3")
+    clocked.sites.run(2)
+    is_taken, _ = clocked.call(SERVER, "take")
+    assert (is_taken, clocked.holder) == (False, None)
+
+
+def test_a_topic_without_a_reader_under_control_and_a_silent_reader_are_named(clocked: Drive) -> None:
+    clocked.sites.reload(clocked.robot, imports=[DRIVE])
+    clocked.sites.run(2)
+    assert clocked.call(SERVER, "take") == (False, control_services.NO_READER)
+    asked: list[str] = []
+
+    def only_show(question: Question, now: Timestamps) -> Mapping[str, object] | None:
+        asked.append(str(question.body.get("do")))
+        return {"state": "free", "generation": 1} if len(asked) == 1 else {}
+
+    clocked.robot.member.diagnostics.register("control", only_show, for_foreign=True)
+    is_taken, text = clocked.call(SERVER, "take")
+    assert (is_taken, asked) == (False, ["None", "take"])
+    assert "no answer: it may have been done" in text
+
+
+def test_services_go_with_their_topic_and_a_graph_without_the_type_says_so(sites: Sites) -> None:
+    poor = FakeGraph(2, {**channels(), TWIST: channel(TWIST)}, {})
+    rule = f"{DRIVE}, control: exclusive"
+    desk, other = sites.add(SERVER, expose=[rule], graph=graph()), sites.add(OTHER, expose=[rule], graph=poor)
+    publications = [each.graph.publish("/stick", "/cmd_vel", TWIST) for each in (desk, other)]
+    assert sites.run(5, lambda: bool(desk.carried and other.carried))
+    assert sorted(each.end.name for each in desk.graph.servers) == [
+        f"/cmd_vel/control/{act}" for act in ("give", "show", "take")
+    ]
+    assert other.faults == {"unknown-type": 1}
+    publications[0].close()
+    assert sites.run(20, lambda: not desk.graph.servers)

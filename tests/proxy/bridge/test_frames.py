@@ -25,11 +25,11 @@ def sites(tmp_path: Path) -> Sites:
     return Sites(tmp_path)
 
 
-def transforms(*pairs: str) -> bytes:
-    """Return the transforms of pairs, each as parent>child."""
+def transforms(*pairs: str, at: tuple[float, float] = (0.0, 0.0)) -> bytes:
+    """Return the transforms of pairs, each as parent>child, and all at one place in x and y."""
     types = _STORE.types
-    zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    pose = types["geometry_msgs/msg/Transform"](zero, types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0))
+    place = types["geometry_msgs/msg/Vector3"](*at, 0.0)
+    pose = types["geometry_msgs/msg/Transform"](place, types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0))
     stamp = types["builtin_interfaces/msg/Time"](0, 0)
     listed = [
         types["geometry_msgs/msg/TransformStamped"](types["std_msgs/msg/Header"](stamp, parent), child, pose)
@@ -38,10 +38,19 @@ def transforms(*pairs: str) -> bytes:
     return bytes(_STORE.serialize_cdr(types[TRANSFORMS](listed), TRANSFORMS))
 
 
+def placed(ear: Ear) -> list[tuple[str, float, float]]:
+    """Return the pairs in all messages, and the place of each in x and y."""
+    messages: list[Any] = [_STORE.deserialize_cdr(raw, TRANSFORMS) for raw in ear.heard]
+    return [
+        (f"{each.header.frame_id}>{each.child_frame_id}", each.transform.translation.x, each.transform.translation.y)
+        for message in messages
+        for each in message.transforms
+    ]
+
+
 def pairs_of(ear: Ear) -> list[str]:
     """Return the pairs in all messages."""
-    messages: list[Any] = [_STORE.deserialize_cdr(raw, TRANSFORMS) for raw in ear.heard]
-    return [f"{each.header.frame_id}>{each.child_frame_id}" for message in messages for each in message.transforms]
+    return [pair for pair, _, _ in placed(ear)]
 
 
 def _has(ear: Ear, pairs: list[str]) -> bool:

@@ -27,8 +27,8 @@ GRAPH = {  # what a verb prints, by call
 }
 PAGE = Path(__file__).parents[3] / "docs/reference/ros2cli.md"
 NOT = """
-Not the same: GIDs are those of the other graph. Events of deadline, liveliness and lifespan do not cross. `component`
-and tf2 use services and topics as above; the test does not run them, for their types have no wheels.
+Not the same: GIDs are those of the other graph. Of QoS events a missed deadline [crosses](qos.md). `component` and tf2
+use services and topics as above; the test does not run them, for their types have no wheels.
 """
 VERBS = {
     **GRAPH,

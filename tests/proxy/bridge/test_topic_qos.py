@@ -357,6 +357,19 @@ def test_a_reader_that_requests_more_than_the_source_offers_hears_what_is_new(si
     assert sites.run(1, lambda: ear.texts == ["1"])
 
 
+def test_a_deadline_that_the_far_publisher_keeps_is_offered_here_and_a_shorter_one_is_reported(sites: Sites) -> None:
+    robot, server = pair(sites)
+    ear = Ear(server.graph, "/chatter", qos=replace(default(), deadline=(2, 0)))
+    talker = robot.graph.publish("/talker", "/chatter", STRING, replace(default(), deadline=(1, 0)))
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("1"))
+    assert sites.run(1, lambda: ear.texts == ["1"])
+    assert (offered(server).deadline, server.faults) == ((2, 0), {})
+    ear.leave()
+    Ear(server.graph, "/chatter", qos=replace(default(), deadline=(0, 500_000_000)), node="/strict")
+    assert sites.run(1, lambda: server.faults == {"qos": 1})
+
+
 @pytest.mark.parametrize(
     "qos",
     [replace(default(), deadline=(1, 0)), replace(default(), liveliness="manual_by_topic")],

@@ -29,6 +29,9 @@ class Steps:
     def step(self, until_s: float | None) -> None:
         self.sites.run(0.01)
 
+    def every(self, *_: object) -> None:
+        """Call nothing."""
+
 
 class Leaving(ProxyNode):
     """Node in virtual time that has been asked to leave."""
@@ -53,7 +56,6 @@ def sites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sites:
     sites = Sites(tmp_path)
     monkeypatch.setattr(node, "time", SimpleNamespace(monotonic=lambda: sites.now_s))
     monkeypatch.setattr(bridge_node, "_tell_ready", lambda *_, json: None)
-    monkeypatch.setattr(bridge_node, "_tell_progress", lambda *_: None)
     return sites
 
 

@@ -158,6 +158,7 @@ def test_it_dies_with_its_caller(how: str) -> None:
     [
         ["sleep", "0"],
         [sys.executable, "-c", "pass"],
+        [sys.executable, "-c", "import gdp"],
         [sys.executable, "-I", "-m", "gdp.cli.gdp"],
         ["setpriv", "--reuid", "1", sys.executable, "-m", "gdp.cli.gdp"],
         ["/usr/bin/python3", "-m", "gdp.cli.gdp"],
@@ -167,8 +168,7 @@ def test_what_is_not_plainly_a_program_of_the_project_is_executed(argv: list[str
     assert Program.from_argv(argv) is None
 
 
-def test_another_copy_of_the_project_is_executed(tmp_path: Path) -> None:
-    forked = Zygote.start()  # earlier tests may have changed what that of the session was born into
+def test_another_copy_of_the_project_is_executed(forked: Zygote, tmp_path: Path) -> None:
     (tmp_path / "gdp").mkdir()
     program = Program.from_argv([sys.executable, "-m", "gdp.cli.gdp"])
     assert program is not None
@@ -176,3 +176,23 @@ def test_another_copy_of_the_project_is_executed(tmp_path: Path) -> None:
     assert not forked.can_run(program, dict(os.environ), tmp_path)
     assert not forked.can_run(program, {**os.environ, "PYTHONPATH": str(tmp_path)}, ROOT)
     assert not forked.can_run(program, {**os.environ, "PYTHONHASHSEED": "7"}, ROOT)
+    own = os.environ.get("LD_LIBRARY_PATH", "")
+    assert not forked.can_run(program, {**os.environ, "LD_LIBRARY_PATH": f"{tmp_path}{os.pathsep}{own}"}, ROOT)
+
+
+def test_code_that_imports_the_project_is_forked_on_a_machine_of_a_laboratory() -> None:
+    entered = ["nsenter", "--net=/run/netns/s1", "--", sys.executable, "-c"]
+    program = Program.from_argv([*entered, "import sys\nfrom gdp import names"])
+    assert program is not None
+    assert program.code.startswith("import sys")
+    assert Program.from_argv([*entered, "import gdprint"]) is None
+
+
+@pytest.mark.skipif(Popen.zygote is None, reason="this session executes programs")
+def test_no_import_of_a_test_makes_the_session_execute_its_programs(tmp_path: Path) -> None:
+    program = Program.from_argv([sys.executable, "-m", "gdp.cli.gdp"])
+    assert program is not None
+    assert Popen.zygote is not None
+    assert Popen.zygote.can_run(program, dict(os.environ), ROOT), "what all tests import has changed its surroundings"
+    missing = f"{tmp_path / 'missing'}{os.pathsep}{os.environ.get('LD_LIBRARY_PATH', '')}"  # as cv2 does
+    assert Popen.zygote.can_run(program, {**os.environ, "LD_LIBRARY_PATH": missing}, ROOT)
