@@ -14,8 +14,11 @@ import pytest
 
 from gdp.errors import GdpError
 from gdp.management.control_client import ask_node, find_control_socket
+from gdp.metadata import Metadata
 from gdp.state.control_protocol import Command
+from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, load_card
+from gdp.trust.right import Right
 from lab.internet.access import Access
 from lab.internet.host import Host
 from lab.internet.laboratory import Laboratory
@@ -118,3 +121,30 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
         )
         gdp("domain", "remove", "lab", "robot", "--directory", str(lab))
         until(lambda: {each["label"] for each in links(lab)} == {"arm"}, said, PATIENCE_S)
+
+
+def test_a_machine_that_joined_as_a_holder_serves_its_store_once_the_owner_lets_it(
+    laboratory: Laboratory, tmp_path: Path
+) -> None:
+    border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
+    archive = laboratory.add_host("archive", laboratory.add_site("home", Access.PORT_RESTRICTED))
+    address, lab, home = border.lease().address.partition("/")[0], tmp_path / "lab", tmp_path / "archive"
+
+    def said() -> str:
+        return "".join(each.read_text() for each in tmp_path.glob("*.log"))[-4_000:]
+
+    with contextlib.ExitStack() as stack:
+        words = ("domain", "create", "lab", "--public", address, "--directory", str(lab), "--no-systemd")
+        created = stack.enter_context(running(border, tmp_path, *words))
+        assert created.stdout is not None
+        assert select.select([created.stdout], [], [], PATIENCE_S)[0]
+        token = gdp("domain", "token", "lab", "--directory", str(lab), "--role", "holder")
+        until(lambda: "listening on TCP port" in (tmp_path / "border.log").read_text(), said, PATIENCE_S)
+        join = ("join", "--label", "archive", "--directory", str(home), "--no-systemd")
+        stack.enter_context(running(archive, tmp_path, *join, answer=token))
+        until(lambda: up(home) == {"border"}, said, PATIENCE_S)
+        metadata = Metadata({"kind": "service", "name": "store"})
+        delegation = delegate(lab / "owner", home / "store" / CARD, metadata, [Right.SERVE])
+        install_delegation(home / "store", delegation)
+        until(lambda: "serves store; Ctrl-C ends it" in said(), said, PATIENCE_S)
+        until(lambda: is_found(delegation.name.to_text(), lab / "switch"), said, PATIENCE_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import sys
 from collections.abc import Collection
@@ -18,6 +19,7 @@ from lab.machine import GDP
 from lab.process import LabProcess, until
 from netns_tests.session_lab import PATIENCE_S, SessionLab, lines_of, session_lab
 from proxy.recordings.reader import BagReader
+from tests.gdp.stores.bucket_sites import NAME, environment
 from tests.pages import ROOT
 
 pytestmark = pytest.mark.netns
@@ -95,6 +97,96 @@ def test_a_replayed_drive_is_exported_as_it_was_recorded(tmp_path: Path) -> None
         verified = lab.run("gdp", "store", "verify", segment.parent.name, "--store", str(store))
         assert verified.returncode == 1
         assert "altered" in verified.stdout
+
+
+def test_a_holder_with_an_empty_disk_has_what_its_bucket_has(tmp_path: Path) -> None:
+    pytest.importorskip("moto.server", reason="moto of the extra `dev` is not installed")
+    with session_lab(RIGHTS, TOPICS) as lab:
+        drive, incident = lab.folder / "drive.mcap", lab.folder / "incident.mcap"
+        lab.environment.update(environment("http://127.0.0.1:5000", lab.folder))
+        s3 = lab.launch([sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", "5000"], "s3", heard=False)
+        s3.until_logged("Running on")
+        lab.output(sys.executable, "-c", f"import boto3; boto3.client('s3').create_bucket(Bucket={NAME!r})")
+        lab.output(str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(drive))
+        words = ["--bucket", f"s3://{NAME}/robots", "--upload", "1", "--json"]
+
+        def serve(store: str) -> LabProcess:
+            holder = lab.launch(["gdp", "store", "serve", "holder", "--store", str(lab.folder / store), *words])
+            assert '"ready"' in lines_of(holder, 1)[0]
+            return holder
+
+        first = serve("first")
+        replay = ["gdp-replay", str(drive), "--config", str(robot(lab)), "--rate", "0", "--wait-readers", "0", "--json"]
+        done = lab.run(*replay)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert json.loads(done.stdout.splitlines()[-1])["unconfirmed"] == []
+        lab.kill(first)
+        shutil.rmtree(lab.folder / "first")
+        second = serve("second")
+        exported = lab.run("gdp", "store", "export", *TOPICS, "--node", "investigator", "-o", str(incident), "--json")
+        assert exported.returncode == 0, exported.stdout + exported.stderr
+        assert content(incident) == content(drive)
+        other = ["gdp", "store", "serve", "robot", "--store", str(lab.folder / "third"), *words]
+        refused = lab.run(*other)
+        assert refused.returncode
+        assert "uses it; give each holder a prefix of its own" in refused.stderr
+        for each in lab.output("gdp", "store", "ls", "--store", str(lab.folder / "second"), "--json").splitlines():
+            lab.output("gdp", "store", "verify", json.loads(each)["capsule"], "--store", str(lab.folder / "second"))
+        second.finish(signal.SIGTERM)
+
+
+KEEPING = """
+import sys, time, gdp
+
+try:
+    with gdp.open("robot") as session:
+        session.publisher("/scan", keep=["store"])
+except gdp.LocalError as error:
+    print(error)
+with gdp.open("robot", state="state") as session:
+    with session.publisher("/scan", keep=["store"]) as publisher:
+        for number in range(int(sys.argv[1]), int(sys.argv[2])):
+            publisher.put(b"%d" % number)
+        end_s = time.monotonic() + float(sys.argv[3])
+        while not publisher.is_kept and time.monotonic() < end_s:
+            time.sleep(0.05)
+        print(publisher.is_kept, flush=True)
+"""
+READING = """
+import gdp
+from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
+from gdp.capsule.reading import CapsuleReader
+from gdp.session.protocol.wire import read_message
+from gdp.trust.right import Right
+
+with gdp.open("investigator") as session:
+    topic = session.core.resolve("/scan", Right.READ)
+
+    def ask(request):
+        return HolderAnswer.from_cbor(session.call("store", request.to_cbor(), replication=1).payload)
+
+    (about,) = ask(HolderRequest(ask=Ask.LIST, topic=topic.name)).descriptors
+    reader = CapsuleReader(about, topic.secrets)
+    while not reader.is_done:
+        for kept in reader.handle_response(ask(reader.next_request())):
+            print(read_message(kept.message)[1].decode())
+    print(reader.audit.findings)
+"""
+
+
+def test_a_program_keeps_what_it_publishes_and_the_next_one_uploads_what_the_first_could_not(tmp_path: Path) -> None:
+    with session_lab(RIGHTS, TOPICS) as lab:
+        (lab.folder / "state").mkdir()
+        missing, alone = lab.output(sys.executable, "-c", KEEPING, "0", "300", "0.5").splitlines()
+        assert "state of the session is missing" in missing
+        assert alone == "False"
+        store = lab.folder / "capsules"
+        holder = lab.launch(["gdp", "store", "serve", "holder", "--store", str(store), "--json"])
+        assert '"ready"' in lines_of(holder, 1)[0]
+        assert lab.output(sys.executable, "-c", KEEPING, "300", "400", "20").splitlines()[-1] == "True"
+        *read, findings = lab.output(sys.executable, "-c", READING).splitlines()
+        assert read == [str(each) for each in range(400)]
+        assert findings == "[]"
 
 
 def test_two_holders_are_equal_and_one_repairs_the_segment_of_the_other(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ class HolderRequest(FieldSet):
         offset: where ``data`` begins, or what is read.
         time_ns: read from the last checkpoint at or before this time on; 0: from ``offset`` on.
         data: records to append.
+        gap: bytes before them that the client left out, or has no more.
         descriptor: of a capsule that the holder may not know.
         topic: list capsules of this topic alone; zeros: all.
     """
@@ -50,6 +51,7 @@ class HolderRequest(FieldSet):
     offset: Annotated[int, Keyed("offset", uint(), absent=0, is_omitted=True)] = 0
     time_ns: Annotated[int, Keyed("time", uint(), absent=0, is_omitted=True)] = 0
     data: Annotated[bytes, Keyed("data", octets(most=2 * BATCH_BYTES), absent=b"", is_omitted=True)] = b""
+    gap: Annotated[int, Keyed("gap", uint(), absent=0, is_omitted=True)] = 0
     descriptor: Annotated[Descriptor | None, Keyed("descriptor", inner(Descriptor), absent=None, is_omitted=True)] = (
         None
     )
@@ -61,7 +63,7 @@ class HolderAnswer(FieldSet):
     """Answer of a holder.
 
     Attributes:
-        head: behind the last byte that is on its disk.
+        head: behind the last byte that is on its disk, or in its bucket: confirmed.
         offset: what is to be appended next; of records that were read, where they begin: as asked, or behind a gap.
         data: records, or a part of the last one; the holder's total.
         described: the record with the description that holds where ``data`` begins, if records before it are skipped.

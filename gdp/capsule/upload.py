@@ -1,7 +1,8 @@
 """Upload of a capsule: one bounded batch of records at a time, from where the holder's head is.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The holder confirms what is on its disk. A head that goes
-back, or is ahead of all records, is a lie or a loss, and is reported.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The holder confirms what is on its disk, or later, when it is
+in its bucket; until then it is asked. A head that goes back, or is ahead of all records, is a lie or a loss, and is
+reported.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ class Uploader:
         self._name = name
         self._descriptor = descriptor
         self._head: int | None = None  # None: it is to be asked for
+        self._held = 0  # as the holder answered; ``_head`` leaves out what it shall not get
         self._is_under_way = False
         self._retry_s = -NEVER_S
         self._failures = 0  # in a row
@@ -80,11 +82,12 @@ class Uploader:
         if self._head is None:
             self._is_under_way = True
             return HolderRequest(ask=Ask.HEAD, capsule=self._name)
-        if windows is not None:
-            span = windows.next(self._head, end)
-            if span is None:
-                return None
-            self._head, end = span
+        span = (self._head, end) if windows is None else windows.next(self._head, end)
+        if span is None or self._head >= end:
+            if self.confirmed < self._held:
+                self._head, self._retry_s = None, now_s + POLL_S
+            return None
+        self._head, end = span
         if self._head < begin:
             self._note(f"the holder never had bytes {self._head} to {begin}: the ring here was full")
             self.missing_bytes += begin - self._head
@@ -96,8 +99,10 @@ class Uploader:
 
     def append(self, offset: int, data: bytes) -> HolderRequest:
         """Return the request with records that were read."""
-        descriptor = None if self.confirmed else self._descriptor
-        return HolderRequest(ask=Ask.APPEND, capsule=self._name, offset=offset, data=data, descriptor=descriptor)
+        descriptor, gap = None if self.confirmed else self._descriptor, max(offset - self._held, 0)
+        return HolderRequest(
+            ask=Ask.APPEND, capsule=self._name, offset=offset, data=data, gap=gap, descriptor=descriptor
+        )
 
     def handle_response(self, wire: bytes, end: int, now_s: float) -> None:
         """Process an answer."""
@@ -114,7 +119,8 @@ class Uploader:
             self._retry_s = now_s + RETRY_S
             self._head = None
             return
-        self.confirmed, self._head = head, max(head, answer.offset)
+        self.confirmed, self._held = head, max(head, answer.offset)
+        self._head = self._held
         if not self._is_chosen:
             self._retry_s = now_s + POLL_S
 

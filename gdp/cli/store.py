@@ -9,6 +9,7 @@ import json as json_text
 import logging
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -28,12 +29,15 @@ from gdp.crypto.certificates import Role
 from gdp.errors import GdpError, LocalError
 from gdp.intervals import ANSWER_S, DAY_S, UPKEEP_S
 from gdp.links.uplink import wait_for_device
-from gdp.names import Name
+from gdp.names import ZERO, Name
 from gdp.nodes.membership import load_member
 from gdp.session.protocol.messages import Request
 from gdp.session.session import Session, open_node
 from gdp.session.settings import SessionConfig, settings_of
-from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, StoreLimits, marks_of, remove, stored
+from gdp.stores.bucket import Bucket
+from gdp.stores.bucket_folder import note_place, refuse_other_place, remove_with_bucket, stored_with_bucket
+from gdp.stores.bucket_upkeep import BucketUpkeep
+from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, StoreLimits, marks_of
 from gdp.stores.holder_exchange import run
 from gdp.stores.holder_upkeep import HolderUpkeep
 from gdp.terminal import echo
@@ -77,6 +81,18 @@ def serve(
     peer: Annotated[
         list[str] | None, typer.Option(metavar="SERVICE", help="Another holder, to become equal with. Repeatable.")
     ] = None,
+    bucket: Annotated[
+        str | None, typer.Option(metavar="URL", help="Closed segments go to s3://NAME/PREFIX; the disk is a cache.")
+    ] = None,
+    cache: Annotated[
+        float | None, typer.Option(min=MIN, metavar="GB", help="Of the disk, with a bucket. Default: 10.")
+    ] = None,
+    upload: Annotated[
+        float | None, typer.Option(min=MIN, metavar="S", help="The bucket gets an open segment then. Default: 60.")
+    ] = None,
+    take_bucket: Annotated[
+        bool, typer.Option("--take-bucket", help="Use the bucket although another holder did, which is gone.")
+    ] = False,
     config: Annotated[
         Path | None, typer.Option("--config", metavar="FILE", help="A store.yaml, in place of NODE and these options.")
     ] = None,
@@ -86,20 +102,24 @@ def serve(
     *,
     logs: Logs,
 ) -> None:
-    """Hold capsules until Ctrl-C. What is confirmed to a writer is on the disk; a full disk and a quota refuse.
+    """Hold capsules until Ctrl-C. A full disk and a quota refuse.
 
-    All is read again slowly; what is damaged is repaired from another holder, and printed.
+    What is confirmed to a writer is on the disk; with a bucket, it is in the bucket. All is read again slowly; what is
+    damaged is repaired from the bucket or another holder, and printed.
     """
     stated = {"folder": store, "service": service, "quota_gb": quota, "days": days, "most_gb": most, "peers": peer}
+    stated |= {"bucket": bucket, "cache_gb": cache, "upload_s": upload}
     given = {key: value for key, value in stated.items() if value}
     with running(logs):
         member, holds = _settings(node, given, config)
+        if holds.bucket is not None:
+            Bucket(holds.bucket).close()
         if check:
             name = load_member(member.identity, member.domain, Role.PROXY)[0].name
             report("checked", f"configuration good: holder {name.short}", json=json, name=name.to_text())
             return
         wait_for_device(member.iface, await_iface)
-        _hold(member, holds, json=json)
+        _hold(member, holds, takes=take_bucket, json=json)
 
 
 def _settings(
@@ -116,19 +136,29 @@ def _settings(
     return settings_of(node), HolderConfig.model_construct(None, **given)
 
 
-def _hold(member: SessionConfig, holds: HolderConfig, *, json: bool) -> None:
-    service = holds.service
+def _hold(member: SessionConfig, holds: HolderConfig, *, takes: bool, json: bool) -> None:
+    service, is_backed = holds.service, holds.bucket is not None
+    refuse_other_place(holds.folder, holds.bucket)
     limits = StoreLimits(
         owner_bytes=int(holds.quota_gb * 1e9),
         capsule_bytes=None if holds.most_gb is None else int(holds.most_gb * 1e9),
         age_s=None if holds.days is None else holds.days * DAY_S,
+        cache_bytes=int(holds.cache_gb * 1e9) if is_backed else None,
     )
-    with CapsuleStore(holds.folder, limits) as capsules, open_node(member) as session:
+    with ExitStack() as stack:
+        capsules = stack.enter_context(CapsuleStore(holds.folder, limits))
+        session = stack.enter_context(open_node(member))
+        if holds.bucket is not None:
+            bucket = stack.enter_context(Bucket(holds.bucket))
+            backing = stack.enter_context(BucketUpkeep(capsules, bucket, holds.upload_s))
+            backing.open(session.name, takes=takes)
+            note_place(holds.folder, holds.bucket)
+            backing.start()
 
         def answer(request: Request) -> bytes:
             return capsules.handle(request.payload, request.client)
 
-        server = session.serve(service, answer, workers=2, priority="background")
+        server = session.serve(service, answer, workers=4 if is_backed else 2, priority="background")
         text = f"holder {session.name.short} serves {service}; Ctrl-C ends it"
         report("ready", text, json=json, name=str(server.name))
         upkeep = HolderUpkeep(capsules, holds.peers, time.monotonic())
@@ -141,14 +171,15 @@ def _hold(member: SessionConfig, holds: HolderConfig, *, json: bool) -> None:
                 else:
                     upkeep.ended(holder, time.monotonic())
             for name, fault in capsules.poll_faults().items():
-                report("fault", f"capsule {name.short}: {fault}", json=json, capsule=name.to_text(), detail=fault)
+                text = fault if name == ZERO else f"capsule {name.short}: {fault}"
+                report("fault", text, json=json, capsule=name.to_text(), detail=fault)
 
 
 @app.command("ls", epilog="Example: gdp store ls --store /var/lib/gdp/capsules")
 def list_capsules(store: Folder, json: Json = False) -> None:
     """List the capsules in a folder, with their topic, writer and bytes."""
     with failing_clearly():
-        for capsule in stored(store):
+        for capsule in stored_with_bucket(store):
             _print(_row(capsule), json=json)
 
 
@@ -225,7 +256,7 @@ def rm(name: Which, store: Folder, json: Json = False) -> None:
     """Remove a capsule from a folder whose holder does not run."""
     with failing_clearly():
         found = _find(store, name).name
-        remove(store, found)
+        remove_with_bucket(store, found)
         report("removed", f"capsule {found.short} is removed", json=json, capsule=found.to_text())
 
 
@@ -239,7 +270,7 @@ def ask(session: Session, holder: str, request: HolderRequest) -> HolderAnswer:
 
 
 def _find(store: Path, digits: str) -> StoredCapsule:
-    found = [each for each in stored(store) if each.name.to_text().startswith(digits.lower())]
+    found = [each for each in stored_with_bucket(store) if each.name.to_text().startswith(digits.lower())]
     if len(found) != 1:
         raise LocalError(f"{store}: {len(found)} capsules begin with {digits!r}; gdp store ls lists them")
     return found[0]

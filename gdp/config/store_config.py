@@ -11,6 +11,7 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from gdp.config.schema import Directory, Domain, Identity, Ifname, Section, StateFolder, Unique, load
+from gdp.intervals import MINUTE_S
 
 MIN: Final = 0.001
 
@@ -23,6 +24,9 @@ class HolderConfig(Section):
     quota_gb: float = Field(default=100.0, ge=MIN, description="GB of all topics of one owner.")
     days: float | None = Field(default=None, ge=MIN, description="Older segments go.")
     most_gb: float | None = Field(default=None, ge=MIN, description="GB of one capsule, whose oldest segments go.")
+    bucket: str | None = Field(default=None, description="s3://NAME/PREFIX that gets the segments.")
+    cache_gb: float = Field(default=10.0, ge=MIN, description="GB of the disk, for what the bucket has or shall have.")
+    upload_s: float = Field(default=MINUTE_S, gt=0, description="s after which the bucket gets an open segment, too.")
     peers: Annotated[tuple[str, ...], Unique] = Field(default=(), description="Services of holders to equal.")
 
 

@@ -43,7 +43,7 @@ from gdp.trust.enrolment_wire import (
     UnreachableError,
     apply,
 )
-from gdp.trust.join_token import JoinToken, join_id, join_key, join_proof
+from gdp.trust.join_token import HOLDER_FOLDER, JoinToken, join_id, join_key, join_proof
 
 log = logging.getLogger(__name__)
 
@@ -222,7 +222,8 @@ def _install(
         listen=request.listen,
         uplinks=request.uplinks,
         relays={each.name: news.relays for each in borders},
-        has_proxy=any(role is Role.PROXY for _, role in request.token.role.nodes),
+        has_proxy=any(folder == Role.PROXY.value for folder, _ in nodes),
+        has_store=any(folder == HOLDER_FOLDER for folder, _ in nodes),
     )
     write_configuration(draft, plan, sorted(files))
     write_all(draft / "peers", {record_file_name(each.name): public(each.wire) for each in borders})

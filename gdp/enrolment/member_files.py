@@ -3,8 +3,8 @@
 I/O. The directory of one machine::
 
     member.yaml         who this machine is, and where the enrolment server is
-    switch/  proxy/     keys and memberships of its nodes; a border also has rib/
-    switch.yaml  proxy.yaml  rib.yaml
+    switch/  proxy/     keys and memberships of its nodes; a border has rib/, too; a holder has store/, no proxy/
+    switch.yaml  proxy.yaml  rib.yaml  store.yaml
     owner.pub           key of the domain's owner of names
     trusts/*.crt        roots of other domains
     peers/*.endpoints   endpoint records: the switch opens a tunnel to each
@@ -37,6 +37,7 @@ class MemberConfig(Section):
     domain: Domain = Field(description="The trust domain, and the others whose members are believed.")
     switch: Directory = Field(description="Directory of its switch.")
     proxy: Directory | None = Field(default=None, description="Directory of its proxy. `null`: none.")
+    store: Directory | None = Field(default=None, description="Directory of its holder of capsules. `null`: none.")
     rib: Directory | None = Field(default=None, description="Directory of its RIB. `null`: none.")
     peers: Directory = Field(description="Directory of endpoint records.")
     servers: Annotated[tuple[Annotated[str, AfterValidator(checked_server)], ...], Unique] = Field(
@@ -80,13 +81,14 @@ class MemberFiles:
 
     @property
     def mail_identity(self) -> Path:
-        """Return the directory of the node that mail is for: the proxy, or the switch where there is no proxy."""
-        return self.config.proxy or self.config.switch
+        """Return the directory of the node that mail is for: the proxy or the holder, or the switch without them."""
+        return self.config.proxy or self.config.store or self.config.switch
 
     @property
     def nodes(self) -> tuple[Path, ...]:
         """Return the directories of this machine's nodes, the switch first."""
-        return tuple(each for each in (self.config.switch, self.config.proxy, self.config.rib) if each is not None)
+        config = self.config
+        return tuple(each for each in (config.switch, config.proxy, config.store, config.rib) if each is not None)
 
     @property
     def inbox(self) -> Path:

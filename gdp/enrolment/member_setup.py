@@ -19,11 +19,13 @@ from gdp.links.endpoint_files import RECORD_SUFFIX
 from gdp.names import Name
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.keyring import DELEGATIONS
+from gdp.trust.join_token import HOLDER_FOLDER
 
 LISTEN_PORT: Final = LISTEN_DEFAULT  # of WireGuard; of the enrolment server the TCP port of this number
 RELAY_PORT: Final = 443
 RELAY_FILE: Final = "relay.yaml"
 WATCH_IFACE: Final = "watch0"  # of a border: from there a launcher sees which replicas serve
+_CAPSULES: Final = "capsules"
 _BORDERS: Final = re.compile(r"^borders:\n(?:[ \t].*\n)*", re.MULTILINE)
 _FOLDERS: Final = ("peers", "revocations", "inbox", "state/switch", "state/rib", "state/proxy", "proxy.yaml.d")
 
@@ -53,6 +55,7 @@ class MachinePlan:
     handover: str = ""
     relays: Mapping[Name, Sequence[str]] = field(default_factory=dict)
     has_proxy: bool = True
+    has_store: bool = False
     has_rib: bool = False
 
     @property
@@ -76,6 +79,10 @@ def write_configuration(directory: Path, plan: MachinePlan, trusts: Sequence[str
     texts = {MEMBER_FILE: _member(plan, trusts), "switch.yaml": _switch(plan, trusts)}
     if plan.has_proxy:
         texts["proxy.yaml"] = _proxy(trusts)
+    if plan.has_store:
+        write_all(directory / HOLDER_FOLDER / DELEGATIONS, {})
+        write_all(directory / _CAPSULES, {})
+        texts["store.yaml"] = _node(HOLDER_FOLDER, trusts) + f"iface: store0\nholds: {{folder: {_CAPSULES}}}\n"
     if plan.has_relay:
         texts[RELAY_FILE] = _relay(plan, trusts)
     if plan.has_rib:
@@ -111,6 +118,7 @@ def record_file_name(name: Name) -> str:
 def _member(plan: MachinePlan, trusts: Sequence[str]) -> str:
     lines = [f"label: {json.dumps(plan.label)}", f"role: {plan.role}", _domain("switch", trusts), "switch: switch"]
     lines += ["proxy: proxy"] if plan.has_proxy else []
+    lines += [f"store: {HOLDER_FOLDER}"] if plan.has_store else []
     lines += ["rib: rib"] if plan.has_rib else []
     return "\n".join([*lines, "peers: peers", f"servers: {json.dumps(list(plan.servers))}", ""])
 
@@ -118,6 +126,7 @@ def _member(plan: MachinePlan, trusts: Sequence[str]) -> str:
 def _switch(plan: MachinePlan, trusts: Sequence[str]) -> str:
     attach = ["rib0"] if plan.has_rib else []
     attach += ["proxy0"] if plan.has_proxy else []
+    attach += ["store0"] if plan.has_store else []
     attach += [WATCH_IFACE] if plan.has_rib else []
     links = {"listen": plan.listen, "peers": "peers"}
     public_line = f"  public: {json.dumps(list(plan.public))}\n" if plan.public else ""

@@ -98,6 +98,11 @@ def programs_of(files: MemberFiles) -> list[MachineProgram]:
                 environment=_ros_environment(),
             )
         )
+    if files.config.store is not None:
+        config = directory / "store.yaml"
+        argv, folder = _module("gdp.cli.gdp", *_COMMANDS["store"][1:], config, "--await-iface", _AWAIT_S), _held(config)
+        title = _TITLES["store"]
+        found.append(MachineProgram(name="store", title=title, argv=argv, capabilities=_NET, writes=folder))
     found.append(
         MachineProgram(
             name="agent",
@@ -118,8 +123,13 @@ def node_program(name: str, config: Path) -> MachineProgram:
         argv=argv,
         environment=_ros_environment() if name == "proxy" else (),
         config=config,
-        writes=StoreConfig.load(config).holds.folder.resolve() if name == "store" else None,
+        writes=_held(config) if name == "store" else None,
     )
+
+
+def _held(config: Path) -> Path:
+    """Return the folder of a holder's capsules."""
+    return StoreConfig.load(config).holds.folder.resolve()
 
 
 def missing_ros() -> str:

@@ -68,7 +68,7 @@ def _unit(machine: Machine, program: MachineProgram, switch: str | None) -> str:
     if machine.is_member:
         rights = " ".join(program.capabilities)
         changes |= {key: f"{key}={rights}" for key in ("AmbientCapabilities", "CapabilityBoundingSet")}
-        changes |= {"Restart": "Restart=always"} | ({} if is_node else _OF_OTHERS)
+        changes |= {"Restart": "Restart=always"} | ({} if is_node or program.name == "store" else _OF_OTHERS)
     of_ros = (Path(each) for _, value in program.environment for each in value.split(":") if each.startswith("/"))
     is_at_home = any(_below(each, *_HOMES) for each in (*folders, *of_ros))
     changes["ProtectHome"] = f"ProtectHome={'read-only' if is_at_home else 'yes'}"

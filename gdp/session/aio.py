@@ -18,11 +18,12 @@ from gdp.intervals import ATTACH_S, GOODBYE_S, LINGER_S
 from gdp.service.replication import Replication
 from gdp.session.loop_driver import LoopDriver
 from gdp.session.node import SessionNode
+from gdp.session.protocol.client_core import CALL_TIMEOUT_S
 from gdp.session.protocol.errors import ClosedError
 from gdp.session.protocol.messages import Message, NameLike, Paths, Request, Response, Sign
 from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
 from gdp.session.protocol.wire import message_to_wire
-from gdp.session.session import CALL_TIMEOUT_S, checked_response
+from gdp.session.session import checked_response
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.trust.advertisement import paths_value, session_value
 

@@ -31,8 +31,7 @@ from gdp.limits import WINDOW_BYTES
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.service.replication import Mode, Replication
-from gdp.session.protocol.client_core import Call, ClientCore
-from gdp.session.session import CALL_TIMEOUT_S
+from gdp.session.protocol.client_core import CALL_TIMEOUT_S, Call, ClientCore
 from gdp.stores.capsule_ring import CapsuleRing
 
 log = logging.getLogger(__name__)

@@ -6,13 +6,14 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from gdp.client.participant import Participant
+from gdp.client.participant import Participant, Topic
+from gdp.client.publisher import Publisher
 from gdp.crypto.certificates import Role
-from gdp.errors import GdpError
+from gdp.errors import GdpError, LocalError
 from gdp.intervals import UPKEEP_S
 from gdp.links.uplink import load_plane, open_uplink
 from gdp.names import Name
@@ -24,6 +25,9 @@ from gdp.session.protocol.core import SessionCore
 from gdp.session.protocol.errors import SessionError
 from gdp.session.settings import SessionConfig
 from gdp.state.node_state import MemberState
+
+if TYPE_CHECKING:
+    from gdp.session.kept_topics import KeptTopics
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +44,8 @@ class SessionNode(Node):
 
     def __init__(self, config: SessionConfig) -> None:
         identity, policy = member = load_member(config.identity, config.domain, Role.PROXY)
-        self._directory = config.delegation_directory
+        self._directory, self._state = config.delegation_directory, config.state
+        self._kept: KeptTopics | None = None
         self.member = Participant(identity, policy, fresh_settings(config.lease_s))
         topics = DelegationStore(self._directory, identity)
         self.core = SessionCore(self.member, topics, lambda: secrets.randbits(64), str(self._directory))
@@ -76,6 +81,21 @@ class SessionNode(Node):
         super().reload()
         self.core.renew(DelegationStore(self._directory, self.identity))
 
+    def keep(self, topic: Topic, publisher: Publisher, holders: Sequence[Topic], most_bytes: int) -> KeptTopics:
+        """Keep what a publisher publishes from now on.
+
+        Raises:
+            LocalError: the session has no ``state``, or as for ``KeptTopics.keep``.
+        """
+        from gdp.session.kept_topics import CAPSULES, KeptTopics
+
+        if self._state is None:
+            raise LocalError("a publisher with keep needs a folder on the disk: state of the session is missing")
+        if self._kept is None:
+            self._kept = KeptTopics(self.core, self.identity, self._state / CAPSULES)
+        self._kept.keep(topic, publisher, holders, most_bytes)
+        return self._kept
+
     def reload_for_epoch(self) -> None:
         """Read the delegations again, because an epoch begins; an error is logged."""
         try:
@@ -85,6 +105,8 @@ class SessionNode(Node):
 
     def close(self) -> None:
         """Close the device and release the identity."""
+        if self._kept is not None:
+            self._kept.close()
         self._opened.close()
 
 

@@ -12,13 +12,13 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Final
 
 from gdp.closing import ClosedOnExit
 from gdp.intervals import ATTACH_S, GOODBYE_S, LINGER_S
 from gdp.service.replication import Replication
 from gdp.session.driver import Driver, ThreadDriver
 from gdp.session.node import SessionNode
+from gdp.session.protocol.client_core import CALL_TIMEOUT_S
 from gdp.session.protocol.errors import ClosedError, SessionTimeoutError
 from gdp.session.protocol.messages import Message, NameLike, Paths, Request, Response, Sign
 from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
@@ -27,8 +27,6 @@ from gdp.session.settings import SessionConfig, settings_of
 from gdp.trust.advertisement import paths_value, session_value
 
 log = logging.getLogger(__name__)
-
-CALL_TIMEOUT_S: Final = 10.0
 
 
 class Publisher(BasePublisher[Driver], ClosedOnExit):

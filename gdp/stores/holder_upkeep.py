@@ -81,15 +81,27 @@ class HolderUpkeep:
         """Verify the segments of one capsule."""
         chain = None
         for offset in capsule.segments.offsets:
+            if offset in capsule.segments.absent:  # the bucket's own list says whether it has what it was given
+                chain = None
+                continue
             chain = chain or Chain(capsule.name, capsule.descriptor.key)
             try:
                 for _ in _verified(capsule, offset, chain):
                     yield True
             except GdpError as error:
                 chain = None
-                if offset in capsule.segments.offsets:
+                if self._is_fetched(capsule, offset):
+                    self._store.note(capsule.name, f"the segment at {offset} is repaired from the bucket: {error}")
+                elif offset in capsule.segments.offsets:
                     self._unasked[capsule, offset] = list(self._holders)
                     self._store.note(capsule.name, f"the segment at {offset} is damaged: {error}")
+
+    def _is_fetched(self, capsule: StoredCapsule, offset: int) -> bool:
+        try:
+            return self._store.fetch_again(capsule, offset)
+        except GdpError as error:
+            self._store.note(capsule.name, f"the segment at {offset} is not repaired from the bucket: {error}")
+            return False
 
 
 def _verified(capsule: StoredCapsule, offset: int, chain: Chain) -> Iterator[None]:

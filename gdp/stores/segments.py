@@ -1,7 +1,8 @@
 """Segment files of one capsule: bytes by offset, of which the oldest files may be dropped.
 
 I/O. Each file is named by the offset of its first byte, in hex, and begins with a checkpoint. What ``append`` has
-returned from is on the disk (fdatasync; a new file's name too). A write that fails leaves no byte behind.
+returned from is on the disk (fdatasync; a new file's name too). A write that fails leaves no byte behind. A file may
+be elsewhere: it is fetched when it is read. One thread writes, and others may read meanwhile.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import errno
 import os
 from bisect import bisect_right
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +19,7 @@ from gdp.errors import StoreError
 from gdp.stores.files import private, write_all
 
 SEGMENT_BYTES: Final = 64 << 20  # after which the next checkpoint begins a file
-_SUFFIX: Final = ".records"
+SUFFIX: Final = ".records"
 
 
 class Segments(ClosedOnExit):
@@ -26,6 +28,10 @@ class Segments(ClosedOnExit):
     Args:
         folder: is made if it is missing.
         spare_bytes: free space of the disk below which nothing is appended.
+
+    Attributes:
+        absent: offsets of the files that are elsewhere.
+        fetch: returns such a file, whole.
 
     Raises:
         StoreError: the system refuses; every method may raise this.
@@ -36,9 +42,11 @@ class Segments(ClosedOnExit):
         self._spare_bytes = spare_bytes
         self._sizes: dict[int, int] = {}  # by offset, rising
         self._last: int | None = None  # descriptor of the last file
+        self.absent: set[int] = set()
+        self.fetch: Callable[[int], bytes] | None = None
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            for path in sorted(folder.glob("*" + _SUFFIX)):
+            for path in sorted(folder.glob("*" + SUFFIX)):
                 if size := path.stat().st_size:  # an empty one was begun before a crash
                     self._sizes[int(path.stem, 16)] = size
         except (OSError, ValueError) as error:
@@ -68,6 +76,11 @@ class Segments(ClosedOnExit):
     def held_bytes(self) -> int:
         """Return the bytes of all files."""
         return sum(self._sizes.values())
+
+    @property
+    def here_bytes(self) -> int:
+        """Return the bytes of those that are here."""
+        return self.held_bytes - sum(map(self.size_of, list(self.absent)))
 
     def size_of(self, offset: int) -> int:
         """Return the bytes of the file that begins at an offset; 0: there is none."""
@@ -107,15 +120,22 @@ class Segments(ClosedOnExit):
         index = max(bisect_right(begins, offset) - 1, 0)
         if not begins:
             return offset, b""
-        if offset >= begins[index] + self._sizes[begins[index]] and index + 1 < len(begins):
+        if offset >= begins[index] + self.size_of(begins[index]) and index + 1 < len(begins):
             index += 1
-        offset = max(offset, begins[index])
+        begin = begins[index]
+        offset = max(offset, begin)
+        most = max(min(most, begin + self.size_of(begin) - offset), 0)  # what is behind is not on the disk yet
         try:
-            with self._path(begins[index]).open("rb") as file:
-                file.seek(offset - begins[index])
-                return offset, file.read(most)
+            if begin not in self.absent:
+                with self._path(begin).open("rb") as file:
+                    file.seek(offset - begin)
+                    return offset, file.read(most)
         except OSError as error:
-            raise StoreError(f"{self.folder}: {error.strerror}") from error
+            if begin not in self.absent:  # else it was evicted meanwhile
+                raise StoreError(f"{self.folder}: {error.strerror}") from error
+        if self.fetch is None:
+            raise StoreError(f"{self._path(begin)}: is in a bucket, which is not open")
+        return offset, self.fetch(begin)[offset - begin :][:most]
 
     def has(self, offset: int, data: bytes) -> bool:
         """Return whether what is here from an offset on is the same, as far as something is here."""
@@ -138,7 +158,37 @@ class Segments(ClosedOnExit):
         """
         self.close()
         write_all(self.folder, {self._path(offset).name: private(data)}, force=True)
-        self._sizes = dict(sorted({**self._sizes, offset: len(data)}.items()))
+        self.absent.discard(offset)
+        self._set(offset, len(data))
+
+    def set_absent(self, offset: int, size: int) -> None:
+        """Note that the file which begins at an offset is elsewhere, and has so many bytes; 0: it is nowhere."""
+        self.close()
+        self.absent.add(offset)
+        self._set(offset, size)
+        if not size:
+            self.drop(offset)
+
+    def keep_fetched(self, offset: int, data: bytes) -> None:
+        """Have an absent file here again. Raises ``LocalError``: the system refuses."""
+        write_all(self.folder, {self._path(offset).name: private(data)}, force=True)
+        self.absent.discard(offset)
+        if not self.size_of(offset):  # it was dropped meanwhile
+            self._path(offset).unlink(missing_ok=True)
+
+    def evict(self, offset: int) -> None:
+        """Remove a file that is elsewhere, too."""
+        if offset == self.last:
+            self.close()
+        self.absent.add(offset)
+        self._path(offset).unlink(missing_ok=True)
+
+    def age_of(self, offset: int) -> float:
+        """Return when the file that begins at an offset was written or fetched last, Unix seconds; 0: it is gone."""
+        try:
+            return self._path(offset).stat().st_mtime
+        except OSError:
+            return 0.0
 
     def cut(self, end: int) -> None:
         """Drop what lies behind an offset within the last file."""
@@ -154,12 +204,16 @@ class Segments(ClosedOnExit):
             self.close()
         self._path(offset).unlink(missing_ok=True)
         del self._sizes[offset]
+        self.absent.discard(offset)
 
     def close(self) -> None:
         """Close the last file."""
         if self._last is not None:
             os.close(self._last)
             self._last = None
+
+    def _set(self, offset: int, size: int) -> None:
+        self._sizes = dict(sorted({**self._sizes, offset: size}.items()))
 
     def _begin_file(self, offset: int) -> None:
         self.close()
@@ -174,8 +228,10 @@ class Segments(ClosedOnExit):
 
     def _handle(self) -> int:
         if self._last is None:
+            if self.last in self.absent:
+                self.read(self.last, 1)
             self._last = os.open(self._path(self.last), os.O_RDWR | os.O_CLOEXEC)
         return self._last
 
     def _path(self, offset: int) -> Path:
-        return self.folder / f"{offset:016x}{_SUFFIX}"
+        return self.folder / f"{offset:016x}{SUFFIX}"

@@ -31,6 +31,7 @@ from gdp.host_port import checked_host_port, split_host_port
 JOIN_SECRET_BYTES: Final = 16
 JOIN_ID_BYTES: Final = 16
 SERVERS_MAX: Final = 8
+HOLDER_FOLDER: Final = "store"
 _UNIX: Final = "unix:"
 _SERVER_MAX_BYTES: Final = 255
 _PREFIX: Final = "gdp1"
@@ -51,6 +52,7 @@ class JoinRole(str, Enum):
     LEAF = "leaf"  # a leaf switch alone, for a program that brings its own node
     MACHINE = "machine"  # of a cluster: a leaf switch, and a proxy with delegations
     GATEWAY = "gateway"  # of a cluster: the same, and its switch may forward for others
+    HOLDER = "holder"  # a leaf switch and a holder of capsules
 
     @property
     def is_of_cluster(self) -> bool:
@@ -61,7 +63,8 @@ class JoinRole(str, Enum):
     def nodes(self) -> tuple[tuple[str, Role], ...]:
         """Return the folder and the role of each node of the machine; the switch is the first."""
         switch = Role.SWITCH if self in (JoinRole.SWITCH, JoinRole.GATEWAY) else Role.LEAF
-        proxy = () if self is JoinRole.LEAF else ((Role.PROXY.value, Role.PROXY),)
+        folder = HOLDER_FOLDER if self is JoinRole.HOLDER else Role.PROXY.value
+        proxy = () if self is JoinRole.LEAF else ((folder, Role.PROXY),)
         return ((Role.SWITCH.value, switch), *proxy)
 
 

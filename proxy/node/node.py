@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import Final
 
 from gdp.client.clock_exchange import ClockExchange
 from gdp.client.participant import Participant, Topic
@@ -26,14 +25,13 @@ from gdp.nodes.node import Node, common_sources
 from gdp.nodes.node_log import OnWait
 from gdp.nodes.rights import confine_proxy
 from gdp.runtime.runtime import Runtime, now
+from gdp.session.kept_topics import CAPSULES
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.keeping import TopicKeeper
 from proxy.config.config import ProxyConfig
 from proxy.node.proxy_state import ProxyState, proxy_handlers, proxy_sources
 
 log = logging.getLogger(__name__)
-
-CAPSULES: Final = "capsules"  # folder of rings, within that of the state
 
 
 class ProxyNode(Node):

@@ -30,8 +30,7 @@ from gdp.capsule.holder import BATCH_BYTES, Ask, HolderRequest
 from gdp.capsule.record import RecordType
 from gdp.intervals import ADVERTISEMENT
 from gdp.service.replication import Mode, Replication
-from gdp.session.protocol.client_core import Call, ClientCore
-from gdp.session.session import CALL_TIMEOUT_S
+from gdp.session.protocol.client_core import CALL_TIMEOUT_S, Call, ClientCore
 from gdp.stores.capsule_store import CapsuleStore
 from gdp.trust.right import Right
 from tests.journeys.capsules import LIMITS, STORE, Holder, Keeping, read_from

@@ -26,6 +26,7 @@ from gdp.session.protocol.wire import LEAVING, REQUEST, SERVING, read_response, 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+CALL_TIMEOUT_S: Final = 10.0
 _GONE: Final = "the server has gone"
 
 

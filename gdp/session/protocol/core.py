@@ -39,6 +39,20 @@ class _Receiver(Protocol):
         """Process one message; raises ``RemoteError`` if it is malformed."""
 
 
+class _Service(Protocol):
+    """What has timers of its own."""
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+
+    def handle_timer(self, now_s: float) -> None:
+        """Handle the timers that are due."""
+
+
+class _Keeper(_Receiver, _Service, Protocol):
+    """What calls holders of history, and gets their messages."""
+
+
 class Inbox:
     """Messages of one subscription that the program has not received yet.
 
@@ -109,7 +123,7 @@ class SessionCore:
         self._receivers: dict[Name, _Receiver] = {}  # by a name that is read, served or called
         self._clients: dict[Name, ClientCore] = {}
         self._servers: dict[Name, ServerCore] = {}
-        self._services: list[ClientCore | ServerCore] = []
+        self._services: list[_Service] = []
         self.malformed = 0
 
     # names
@@ -198,6 +212,12 @@ class SessionCore:
             self._receivers[topic.name] = self._clients[topic.name] = client
             self._services.append(client)
         client.begin(call, now_s)
+
+    def add_service(self, service: _Keeper, names: Iterable[Name]) -> None:
+        """Have a keeper handled, and get what comes on the names that it calls."""
+        self._receivers.update(dict.fromkeys(names, service))
+        if service not in self._services:
+            self._services.append(service)
 
     def close(self, now_s: float) -> None:
         """Close everything, and send a goodbye."""

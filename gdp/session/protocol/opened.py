@@ -6,14 +6,14 @@ Sans-I/O, by its driver; ``session.py`` and ``aio.py`` add the calls that wait.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import Priority, SendOptions, checked, is_urgent
-from gdp.errors import LocalError
+from gdp.errors import GdpError, LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.replication import Replication
@@ -59,8 +59,21 @@ class Node(Protocol):
     def reload(self) -> None:
         """Read the delegations again."""
 
+    def keep(self, topic: Topic, publisher: Publisher, holders: Sequence[Topic], most_bytes: int) -> Kept:
+        """Keep what a publisher publishes from now on. Raises ``GdpError``: there is no folder for it."""
+
     def close(self) -> None:
         """Close the device."""
+
+
+class Kept(Protocol):
+    """Interface of the keeper of a session's topics."""
+
+    def is_uploaded(self, topic: Name) -> bool:
+        """Return whether each holder has confirmed all that was published."""
+
+    def release(self, topic: Name) -> None:
+        """Keep a topic no more."""
 
 
 class BaseSession(Generic[_D, _P, _S, _V, _H]):
@@ -107,6 +120,8 @@ class BaseSession(Generic[_D, _P, _S, _V, _H]):
         max_bits_s: float | None = None,
         repairs: bool = True,
         own_pace: bool = False,
+        keep: Sequence[NameLike] = (),
+        keep_bytes: int = 10**9,
     ) -> _P:
         """Publish a name from now on.
 
@@ -126,10 +141,15 @@ class BaseSession(Generic[_D, _P, _S, _V, _H]):
             repairs: without ``reliable``: lost parts of a message are sent again while that can be in time.
             own_pace: without ``reliable``: each reader gets what its path carries; otherwise the slowest one governs.
 
+            keep: services of holders that get all messages, in a capsule; they wait in ``state`` of the session until
+                each has them, ``keep_bytes`` at most.
+
         Raises:
-            DelegationError: the node may not publish it.
-            LocalError: the session publishes it already, or an option is out of bounds.
+            DelegationError: the node may not publish it, or call a holder.
+            LocalError: the session publishes it already, an option is out of bounds, or ``state`` is missing.
+            StoreError: the disk refuses.
         """
+        holders = [self.core.resolve(each, Right.CALL) for each in keep]
         topic = self.core.resolve(name, Right.PUBLISH)
         urgent = is_urgent(priority)
         options = SendOptions(
@@ -153,6 +173,12 @@ class BaseSession(Generic[_D, _P, _S, _V, _H]):
             )
         )
         publisher = self._publisher_type(self, topic, made, reliable=reliable)
+        if holders:
+            try:
+                publisher.kept = self.driver.run(lambda: self._node.keep(topic, made, holders, keep_bytes))
+            except GdpError:
+                publisher.close()
+                raise
         self._opened.append(publisher)
         return publisher
 
@@ -281,6 +307,7 @@ class BasePublisher(Opened[_D]):
         super().__init__(session, topic)
         self._publisher = publisher
         self._is_reliable = reliable
+        self.kept: Kept | None = None
 
     @property
     def readers(self) -> int:
@@ -322,11 +349,19 @@ class BasePublisher(Opened[_D]):
         """Return whether large messages get parity against loss: the rule allows it, and NumPy is installed."""
         return self._publisher.protection.parity.is_enabled and self._publisher.protection.parity.is_available
 
+    @property
+    def is_kept(self) -> bool:
+        """Return whether each holder has confirmed all that was published; false without ``keep``."""
+        kept = self.kept
+        return kept is not None and self._driver.run(lambda: kept.is_uploaded(self.name))
+
     def close(self) -> None:
         """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""
         if not self._is_closed:
             self._is_closed = True
             self._session.forget(self)
+            if self.kept is not None:
+                self._driver.run(partial(self.kept.release, self.name))
             self._driver.run(partial(self._session.core.member.withdraw, self.name))
 
     def _check(self, payload: bytes) -> None:

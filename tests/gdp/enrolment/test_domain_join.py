@@ -10,11 +10,17 @@ import pytest
 
 from gdp.config.config import SwitchConfig
 from gdp.config.relay_config import RelayConfig
+from gdp.config.store_config import StoreConfig
 from gdp.control.endpoints import CandidateType, EndpointRecord
 from gdp.crypto.certificates import Role
+from gdp.enrolment import service_units
 from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.programs import read_machine
+from gdp.enrolment.service_units import service_texts
 from gdp.nodes.membership import load_policy
+from gdp.session.settings import settings_of
 from gdp.stores.keyring import load_identity
+from gdp.trust.join_token import JoinRole
 from tests.gdp.enrolment.lab import Lab, running_lab
 
 
@@ -30,6 +36,31 @@ def test_a_robot_becomes_a_leaf_switch_and_a_proxy_of_the_domain(lab: Lab) -> No
     assert load_identity(lab.folder / "robot/switch", now).role is Role.LEAF
     assert load_identity(lab.folder / "robot/proxy", now).role is Role.PROXY
     assert load_identity(lab.folder / "robot/proxy", now).root.label == "lab"
+
+
+def test_a_holder_has_an_identity_that_a_proxy_has_elsewhere_and_runs_its_store(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service_units, "_PRIVATE_TMP", ())
+    lab.join("archive", lab.token(JoinRole.HOLDER))
+    files = MemberFiles.load(lab.folder / "archive")
+    holds = StoreConfig.load(files.directory / "store.yaml")
+    assert load_identity(holds.identity, time.time()).role is Role.PROXY
+    assert files.mail_identity == holds.identity
+    assert [each.name for each in files.nodes] == ["switch", "store"]
+    assert settings_of(files.directory / "store").iface == holds.iface
+    assert holds.iface in SwitchConfig.load(files.directory / "switch.yaml").attach
+    assert holds.holds.folder.is_dir()
+    machine = read_machine(files.directory)
+    assert [each.name for each in machine.programs] == ["switch", "store", "agent"]
+    lines = service_texts(machine)["gdp-archive-store.service"].splitlines()
+    (command,) = [line for line in lines if line.startswith("ExecStart=")]
+    assert command.endswith(f"store serve --config {files.directory}/store.yaml --await-iface 60")
+    assert "Type=exec" in lines
+    assert "Restart=always" in lines
+    assert "CapabilityBoundingSet=CAP_NET_RAW CAP_NET_ADMIN" in lines
+    (families,) = [line for line in lines if line.startswith("RestrictAddressFamilies=")]
+    assert "AF_PACKET" in families.split(), "it has a device of the switch"
 
 
 def test_a_member_of_a_domain_with_a_relay_dials_it_where_udp_is_blocked(tmp_path: Path) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TypeVar
 
+from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.session.protocol.core import SessionCore
+from gdp.session.protocol.opened import Kept
 from gdp.session.session import Session
 from gdp.trust.right import Right
 from lab.simulation import Simulation
@@ -38,6 +40,9 @@ class _Node:
 
     def reload(self) -> None:
         raise LocalError("there are no files")
+
+    def keep(self, topic: Topic, publisher: Publisher, holders: Sequence[Topic], most_bytes: int) -> Kept:
+        raise LocalError("there is no disk")
 
     def close(self) -> None:
         self.is_closed = True

@@ -45,10 +45,10 @@ class Holder:
         self.store = CapsuleStore(self.folder, self.limits, lambda: self.unix_s)
 
     def append(
-        self, data: bytes, offset: int, about: Descriptor | None = None, client: Name | None = None
+        self, data: bytes, offset: int, about: Descriptor | None = None, client: Name | None = None, gap: int = 0
     ) -> HolderAnswer:
         about = about or descriptor()
-        request = HolderRequest(ask=Ask.APPEND, capsule=about.name, offset=offset, data=data, descriptor=about)
+        request = HolderRequest(ask=Ask.APPEND, capsule=about.name, offset=offset, data=data, gap=gap, descriptor=about)
         return HolderAnswer.from_cbor(self.store.handle(request.to_cbor(), client or writer().name))
 
     def ask(self, ask: Ask, about: Descriptor | None = None, **more: int) -> HolderAnswer:
@@ -127,8 +127,10 @@ def test_a_gap_ends_with_a_checkpoint_and_is_named(holder: Holder) -> None:
     holder.append(b"".join(log.wires[: second + 1]), 0)
     with pytest.raises(GdpError):
         holder.append(log.wires[third - 1], offsets[third - 1])
-    data = b"".join(log.wires[third:])
-    assert holder.append(data, offsets[third]).head == offsets[third] + len(data)
+    data, gap = b"".join(log.wires[third:]), offsets[third] - offsets[second + 1]
+    with pytest.raises(StoreError, match=f"{gap} bytes before"):  # the writer may have them
+        holder.append(data, offsets[third])
+    assert holder.append(data, offsets[third], gap=gap).head == offsets[third] + len(data)
     answer = holder.ask(Ask.READ, offset=offsets[second + 1])
     assert (answer.offset, answer.data) == (offsets[third], data)
     (capsule,) = stored(holder.folder)
