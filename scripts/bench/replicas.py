@@ -224,7 +224,7 @@ def _ask(
     series = Series(
         "number", tuple(services), count, (), _CALL_S, lanes, 1 / rate, warm_up, counts_answers=counts_answers
     )
-    with Asking(here, series) as asking:
+    with Asking(here.client, series) as asking:
         return asking.by_service("    requests"), asking
 
 

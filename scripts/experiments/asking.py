@@ -5,9 +5,9 @@ I/O. Starts ``robot.py`` at a place, and reads what it prints.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from typing import Final, Protocol
+from typing import Final
 
 import bench_path  # noqa: F401 - finds ``peers``
 from report import progress
@@ -21,23 +21,17 @@ _BEGIN_S: Final = 90.0
 _SILENT_S: Final = 20.0  # silence of a client between two samples
 
 
-class Place(Protocol):
-    """Machines with a robot: a ``Field``, or a ``TagCluster``."""
-
-    def client(self, place: str, role: str, **settings: object) -> LabProcess:
-        """Start a role of ``robot.py`` at a machine."""
-
-
 class Asking(ClosedOnExit):
     """Series in progress, read a sample at a time; a context manager that ends its client.
 
-    ``twice``: surplus answers that reached a call; None until the end, or where they were not counted. ``heard``:
-    answers in all; the same. ``warm_up``: calls of each service before the series.
+    ``start``: starts a role of ``robot.py`` at a machine: ``client`` of a ``Field`` or a ``TagCluster``. ``twice``:
+    surplus answers that reached a call; None until the end, or where they were not counted. ``heard``: answers in all;
+    the same. ``warm_up``: calls of each service before the series.
     """
 
-    def __init__(self, place: Place, series: Series) -> None:
+    def __init__(self, start: Callable[..., LabProcess], series: Series) -> None:
         self._series = series
-        self._client = place.client(_ROBOT, "ask", **asdict(series))
+        self._client = start(_ROBOT, "ask", **asdict(series))
         self.twice: int | None = None
         self.heard: int | None = None
         self.warm_up: dict[str, int] = {}

@@ -3,7 +3,7 @@
 Command: reads ``scripts/data/spot``, prints a table, writes ``docs/experiments/availability.{md,png,json}``.
 
     python scripts/experiments/availability.py                      # everything, about 15 seconds
-    python scripts/experiments/availability.py --recovery 20min --json --quick
+    python scripts/experiments/availability.py --json --quick
 """
 
 from __future__ import annotations
@@ -54,15 +54,13 @@ class Case:
 
 def main(words: Sequence[str] | None = None) -> None:
     """Compute the share of time in which no replica would have been up."""
-    parser = command_line(__doc__)
-    parser.add_argument("--recovery", action="append", help="from a preemption to a replacement; may be repeated")
-    run_experiment(parser, measure, words)
+    run_experiment(command_line(__doc__), measure, words)
 
 
 def measure(options: Options) -> Report:
     """Replay every pool with every recovery time; ``--quick``: with the first one."""
     traces, chance = recorded(), np.random.default_rng(SEED)
-    spans = [seconds_from_text(text) for text in options.recovery or RECOVERIES[: 1 if options.quick else None]]
+    spans = [seconds_from_text(text) for text in RECOVERIES[: 1 if options.quick else None]]
     cases = [case for recovery_s in spans for case in replay(traces, recovery_s, chance)]
     return Report(
         "availability",

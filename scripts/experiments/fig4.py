@@ -57,7 +57,7 @@ def _ask(form: str, count: int) -> tuple[list[Sample], list[float]]:
         for number in (_WARM_UP, count):  # the first series sets up the paths
             before = cluster.received_bytes()
             series = Series("tag", services, number * len(services), (), _PATIENCE_S, warm_up=_WARM_UP * len(services))
-            with Asking(cluster, series) as asking:
+            with Asking(cluster.client, series) as asking:
                 samples = list(asking)
             after = cluster.received_bytes()
     return samples, [(now - then) / (count + _WARM_UP) for then, now in zip(before, after, strict=True)]

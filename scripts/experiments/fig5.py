@@ -117,7 +117,7 @@ def _fleet(
 
 def _ask(here: Field, problem: str, count: int, *, patience_s: float) -> dict[str, list[Sample]]:
     series = Series("plan", (_ONE, _TWO), 2 * count, _MACHINES, patience_s, problem=problem)
-    with Asking(here, series) as asking:
+    with Asking(here.client, series) as asking:
         return asking.by_service(problem)
 
 

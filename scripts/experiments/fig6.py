@@ -74,7 +74,7 @@ def measure(options: Options) -> Report:
         with field_of(served, work) as here:
             contention = {"task": setting.role, "service": _ONE, "on_s": ON_S, "off_s": OFF_S}
             conflict = here.client(_MACHINES[0], "busy", **contention) if setting.is_contended else nullcontext()
-            with conflict, Asking(here, series) as asking:
+            with conflict, Asking(here.client, series) as asking:
                 found, plane = asking.by_service(what), here.data_plane
         groups |= {f"{what}, {case}": found[name] for case, name in zip(CASES, (_ONE, _TWO), strict=True)}
         findings += gains(f"{{}} gain, {what}", found[_ONE], found[_TWO], setting.paper)

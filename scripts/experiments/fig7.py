@@ -42,7 +42,7 @@ def measure(options: Options) -> Report:
     calls, warm_up = 2 * len(_LINKS) * count, 2 * len(turns)
     series = Series("count", turns, calls, machines, _PATIENCE_S, gap_s=_GAP_S, warm_up=warm_up)
     delays = {each: delay_s for each, (_, delay_s) in _LINKS.items()}
-    with field_of(served, work, delays) as here, Asking(here, series) as asking:
+    with field_of(served, work, delays) as here, Asking(here.client, series) as asking:
         found, plane = asking.by_service("requests"), here.data_plane
     groups, findings = _compared(found)
     panels = latencies_of(groups, "{case}, {name}", [link for link, _ in _LINKS.values()], 1e3)

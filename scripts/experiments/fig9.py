@@ -66,7 +66,7 @@ def measure(options: Options) -> Report:
         "tag", (SERVICE,), count, (), _PATIENCE_S, lanes=_LANES, gap_s=1 / _HZ, warm_up=10, counts_answers=True
     )
     samples: list[Sample] = []
-    with TagCluster([SERVICE], MACHINES, DEDICATED, _PATIENCE_S) as cluster, Asking(cluster, series) as asking:
+    with TagCluster([SERVICE], MACHINES, DEDICATED, _PATIENCE_S) as cluster, Asking(cluster.client, series) as asking:
         fault_injector = _FaultInjector(cluster)
         for sample in asking:
             samples.append(sample)

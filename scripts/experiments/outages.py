@@ -69,7 +69,7 @@ def measure(options: Options) -> Report:
     count = round(2 * _HZ * seconds)
     series = Series("plan", (_ONE, _TWO), count, _MACHINES, _PATIENCE_S, lanes=_LANES, gap_s=1 / (2 * _HZ))
     samples: list[Sample] = []
-    with field_of(served, work) as here, Asking(here, series) as asking:
+    with field_of(served, work) as here, Asking(here.client, series) as asking:
         stopper = _Stopper(here, drawn)
         begun_s = time.monotonic()
         for sample in asking:

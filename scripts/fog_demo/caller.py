@@ -4,9 +4,9 @@ I/O; needs rclpy. Parameters: ``rate_hz``; ``calls``: total number, 0: until Ctr
 call counts as failed; ``report_s``: interval of lines; ``depth``: queue of responses for this node (ROS 2's default is
 10, and it drops the oldest of more). After SIGUSR1 the node starts no calls and ends when the pending ones have ended.
 A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way", "median_ms", "p99_ms", "silence_ms",
-"unix_s", "by_machine", "done"}``. ``unserved`` are calls omitted because no server existed after the first call.
-``silence_ms`` is the longest time between two responses since the previous line, ``unix_s`` the time of the line. The
-last line has ``"done": true``. Exit status 1 if any call failed.
+"by_machine", "done"}``. ``unserved`` are calls omitted because no server existed after the first call. ``silence_ms``
+is the longest time between two responses since the previous line. The last line has ``"done": true``. Exit status 1 if
+any call failed.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Tally:
         self.by_machine[answer.message] += 1
         self.latencies_s.append(took_s)
 
-    def line(self, *, unix_s: float, done: bool) -> str:
+    def line(self, *, done: bool) -> str:
         """Return the counts as one line of JSON; resets the longest silence."""
         silence_s, self.silence_s = self.silence_s, 0.0
         answered = self.by_machine.total()
@@ -71,8 +71,8 @@ class Tally:
             "unserved": self.unserved,
             "under_way": self.calls - answered - self.failed,
         }
-        times = {"silence_ms": round(1e3 * silence_s, 3), "unix_s": unix_s}
-        return json.dumps({**counts, **spread, **times, "by_machine": dict(self.by_machine), "done": done})
+        spread["silence_ms"] = round(1e3 * silence_s, 3)
+        return json.dumps({**counts, **spread, "by_machine": dict(self.by_machine), "done": done})
 
 
 def main() -> None:
@@ -122,7 +122,7 @@ def main() -> None:
     node.create_timer(1.0 / rate_hz, call)
 
     def report(*, done: bool = False) -> None:
-        print(stats.line(unix_s=time.time(), done=done), flush=True)  # the program's output
+        print(stats.line(done=done), flush=True)  # the program's output
 
     node.create_timer(report_s, report)
     try:
