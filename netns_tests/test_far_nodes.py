@@ -6,6 +6,8 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
 
 import pytest
 
@@ -24,58 +26,73 @@ GONE_S = SERVER.lease_s + 1.0
 LIST = "sorted(name for name, _ in node.get_node_names_and_namespaces() if name.startswith('far_'))"
 
 
-@pytest.fixture
-def pair() -> Iterator[Pair]:
-    with pair_of(NODES) as made:
-        yield made
+@dataclass
+class Site:
+    """Two machines of one run; ``here``: a node that looks at the graph of the second."""
+
+    pair: Pair
+    here: Peer
+    numbers: Iterator[int]
+
+    def takes_s(self, *nodes: str) -> float:
+        """Return how many seconds pass until a graph has these far nodes alone."""
+        begun_s = time.monotonic()
+        until(lambda: self.here.tell(LIST) == [*nodes], nodes)
+        return time.monotonic() - begun_s
+
+    def talker(self) -> tuple[str, Peer]:
+        """Return a node of the first machine, and its name, which no other has had."""
+        name = f"far_talker_{next(self.numbers)}"
+        node = self.pair.node("a", name)
+        node.tell("!from std_msgs.msg import String; kept = [node.create_publisher(String, '/chatter', 1)]")
+        return name, node
+
+    def shown(self) -> tuple[str, Peer]:
+        """Return a node when the graph of the other machine has it, and none of an earlier test."""
+        name, node = self.talker()
+        self.pair.proxy("b")
+        self.takes_s(name)
+        return name, node
 
 
-def takes_s(peer: Peer, nodes: list[str]) -> float:
-    """Return how many seconds pass until a graph has these far nodes."""
-    begun_s = time.monotonic()
-    until(lambda: peer.tell(LIST) == nodes, nodes)
-    return time.monotonic() - begun_s
+@pytest.fixture(scope="module")
+def site() -> Iterator[Site]:
+    with pair_of(NODES) as pair:
+        here = pair._make_node("b", "here")
+        here.tell(LIST)
+        yield Site(pair, here, count())
 
 
-def shown(pair: Pair) -> tuple[Peer, Peer]:
-    """Return a node that is to appear, and one that sees it; the proxy of the latter begins last."""
-    there = pair.node("a", "far_talker")
-    there.tell("!from std_msgs.msg import String; kept = [node.create_publisher(String, '/chatter', 1)]")
-    here = pair._make_node("b", "here")
-    here.tell(LIST)
-    pair.proxy("b")
-    return there, here
-
-
-def test_the_first_far_node_is_there_soon_after_the_proxy_is(pair: Pair) -> None:
-    _, here = shown(pair)
-    assert takes_s(here, ["far_talker"]) <= FIRST_S
-    assert here.tell("[name for name, _ in node.get_publisher_names_and_types_by_node('far_talker', '/')]") == [
+def test_the_first_far_node_is_there_soon_after_the_proxy_is(site: Site) -> None:
+    name, there = site.talker()
+    site.pair._proxies["b"].end()  # it begins last
+    site.pair.proxy("b")
+    assert site.takes_s(name) <= FIRST_S
+    assert site.here.tell(f"[name for name, _ in node.get_publisher_names_and_types_by_node('{name}', '/')]") == [
         "/chatter", "/parameter_events", "/rosout"
     ]  # fmt: skip
-
-
-def test_a_far_node_goes_with_its_process(pair: Pair) -> None:
-    there, here = shown(pair)
-    takes_s(here, ["far_talker"])
     there.end()
-    assert takes_s(here, []) <= GONE_S
 
 
-def test_a_far_node_goes_while_its_machine_is_frozen(pair: Pair) -> None:
-    _, here = shown(pair)
-    takes_s(here, ["far_talker"])
-    pid = pair.proxy("a").pid
+def test_a_far_node_goes_with_its_process(site: Site) -> None:
+    _, there = site.shown()
+    there.end()
+    assert site.takes_s() <= GONE_S
+
+
+def test_a_far_node_goes_while_its_machine_is_frozen(site: Site) -> None:
+    name, there = site.shown()
+    pid = site.pair.proxy("a").pid
     os.kill(pid, signal.SIGSTOP)
-    assert takes_s(here, []) <= GONE_S
+    assert site.takes_s() <= GONE_S
     os.kill(pid, signal.SIGCONT)
-    takes_s(here, ["far_talker"])
+    site.takes_s(name)
+    there.end()
 
 
-def test_a_far_node_goes_with_its_grant(pair: Pair) -> None:
-    _, here = shown(pair)
-    takes_s(here, ["far_talker"])
-    for each in (pair.identity("a") / DELEGATIONS).iterdir():
+def test_a_far_node_goes_with_its_grant(site: Site) -> None:
+    site.shown()
+    for each in (site.pair.identity("a") / DELEGATIONS).iterdir():
         each.unlink()
-    os.kill(pair.proxy("a").pid, signal.SIGHUP)
-    assert takes_s(here, []) <= GONE_S
+    os.kill(site.pair.proxy("a").pid, signal.SIGHUP)
+    assert site.takes_s() <= GONE_S
