@@ -6,8 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import count
+from dataclasses import dataclass, field
 
 import pytest
 
@@ -32,7 +31,7 @@ class Site:
 
     pair: Pair
     here: Peer
-    numbers: Iterator[int]
+    talkers: list[Peer] = field(default_factory=list)
 
     def takes_s(self, *nodes: str) -> float:
         """Return how many seconds pass until a graph has these far nodes alone."""
@@ -40,11 +39,18 @@ class Site:
         until(lambda: self.here.tell(LIST) == [*nodes], nodes)
         return time.monotonic() - begun_s
 
+    def end(self) -> None:
+        """End the talkers."""
+        for each in self.talkers:
+            each.end()
+
     def talker(self) -> tuple[str, Peer]:
-        """Return a node of the first machine, and its name, which no other has had."""
-        name = f"far_talker_{next(self.numbers)}"
+        """Return a node of the first machine, and its name, which no other has had; its proxy sees it."""
+        name = f"far_talker_{len(self.talkers)}"
         node = self.pair.node("a", name)
+        self.talkers.append(node)
         node.tell("!from std_msgs.msg import String; kept = [node.create_publisher(String, '/chatter', 1)]")
+        node.waits_for("len(node.get_node_names()) > 1", True)
         return name, node
 
     def shown(self) -> tuple[str, Peer]:
@@ -56,22 +62,27 @@ class Site:
 
 
 @pytest.fixture(scope="module")
-def site() -> Iterator[Site]:
+def machines() -> Iterator[Site]:
     with pair_of(NODES) as pair:
         here = pair._make_node("b", "here")
         here.tell(LIST)
-        yield Site(pair, here, count())
+        yield Site(pair, here)
+
+
+@pytest.fixture
+def site(machines: Site) -> Iterator[Site]:
+    """The machines, whose talkers end with the test."""
+    yield machines
+    machines.end()
 
 
 def test_the_first_far_node_is_there_soon_after_the_proxy_is(site: Site) -> None:
-    name, there = site.talker()
+    name, _ = site.talker()
     site.pair._proxies["b"].end()  # it begins last
     site.pair.proxy("b")
     assert site.takes_s(name) <= FIRST_S
-    assert site.here.tell(f"[name for name, _ in node.get_publisher_names_and_types_by_node('{name}', '/')]") == [
-        "/chatter", "/parameter_events", "/rosout"
-    ]  # fmt: skip
-    there.end()
+    publishers = f"[name for name, _ in node.get_publisher_names_and_types_by_node('{name}', '/')]"
+    site.here.waits_for(publishers, ["/chatter", "/parameter_events", "/rosout"])
 
 
 def test_a_far_node_goes_with_its_process(site: Site) -> None:
@@ -81,13 +92,12 @@ def test_a_far_node_goes_with_its_process(site: Site) -> None:
 
 
 def test_a_far_node_goes_while_its_machine_is_frozen(site: Site) -> None:
-    name, there = site.shown()
+    name, _ = site.shown()
     pid = site.pair.proxy("a").pid
     os.kill(pid, signal.SIGSTOP)
     assert site.takes_s() <= GONE_S
     os.kill(pid, signal.SIGCONT)
     site.takes_s(name)
-    there.end()
 
 
 def test_a_far_node_goes_with_its_grant(site: Site) -> None:
