@@ -153,7 +153,9 @@ class Proxy:
 class Pair:
     """All running processes. Proxies and the ROS 1 master start on first use."""
 
-    def __init__(self, run: Run, undo: ExitStack, crossings: Sequence[Crossing], hidden: Mapping[str, str]) -> None:
+    def __init__(
+        self, run: Run, undo: ExitStack, crossings: Sequence[Crossing], hidden: Mapping[str, str], lease_s: float
+    ) -> None:
         self.folder = run.directory
         lab = Lab(run, _TOPOLOGY)
         self.spaces, self.machines = lab.namespaces, lab.machines
@@ -165,7 +167,7 @@ class Pair:
         self._proxies = {label: Proxy(self, label) for label in _GRAPHS}
         self._master: LabProcess | None = None
         self._nodes: dict[str, Peer] = {}
-        self._credentials = OverlayCredentials(_TOPOLOGY, self.folder, lease_s=LEASE_S)
+        self._credentials = OverlayCredentials(_TOPOLOGY, self.folder, lease_s=lease_s)
         undo.enter_context(OverlayNodes(lab, self._credentials)).stand_up(_TOPOLOGY.nodes, "auto")
 
     def proxy(self, label: str) -> Proxy:
@@ -263,10 +265,10 @@ class Pair:
 
 
 @contextmanager
-def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None) -> Iterator[Pair]:
+def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None, lease_s: float = LEASE_S) -> Iterator[Pair]:
     """Two machines with proxies for these rules; ``hidden``: a package that a proxy lacks. All ends on leaving."""
     with new_run() as run, ExitStack() as undo:
-        yield Pair(run, undo, crossings, hidden or {})
+        yield Pair(run, undo, crossings, hidden or {}, lease_s)
 
 
 def _metrics(port: int) -> str:

@@ -16,6 +16,7 @@ from gdp.crypto.certificates import Role
 from gdp.diagnosis.answer import Answer, Cause
 from gdp.diagnosis.diagnosis import diagnose
 from gdp.host.ros_processes import ros_processes
+from gdp.intervals import ADVERTISEMENT
 from lab.machine import GDP
 from lab.process import until
 from netns_tests.live_pair import Crossing, Pair, pair_of
@@ -110,7 +111,7 @@ class Asked:
 
 @pytest.fixture(scope="module")
 def asked() -> Iterator[Asked]:
-    with pair_of(*CROSSINGS) as pair:
+    with pair_of(*CROSSINGS, lease_s=ADVERTISEMENT.lease_s) as pair:
         yield Asked(pair)
 
 

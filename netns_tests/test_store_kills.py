@@ -30,7 +30,7 @@ def hold(site: Site) -> LabProcess:
 
 def test_nothing_confirmed_is_lost_when_the_robot_and_its_holder_are_killed() -> None:
     rng = random.Random(5)
-    with history_site(6.0) as site:
+    with history_site(4.0) as site:
         holder = site.holder
         before: dict[str, bytes] = {}
         for number in range(KILLS):

@@ -29,6 +29,7 @@ pytestmark = [
 
 PATIENCE_S = 60.0
 JOIN = "gdp join --label robot"
+_HOLD = "echo mounted && exec sleep infinity"
 HOURS_OFF = "import time; true = time.time; time.time = lambda: true() - 10_800"
 LISTEN = "import socket, time; bound = socket.{}; print('bound', flush=True); time.sleep(600)"
 
@@ -43,20 +44,27 @@ class Field:
     blocked: FreshMachine
     tokens: list[str] = field(default_factory=list)
 
-    def refusal(self, machine: FreshMachine, command: str, around: str = "{}") -> str:
+    def refusal(self, machine: FreshMachine, command: str, mounts: str = "") -> str:
         """Return the sentence with which a command ends; it must leave nothing behind.
 
         Args:
-            around: a shell command in a mount namespace of its own, around the command.
+            mounts: a shell command that changes what this command sees of the machine's files.
         """
-        words = shlex.quote(around.format(command))
-        shell = machine.type(f"unshare --mount -- sh -c {words}", self.tokens[-1])
-        shell.reap(PATIENCE_S)
-        assert shell.code == 2, shell.logged
-        assert len(shell.logged.splitlines()) == 1, shell.logged
-        left = machine.type("ls -A /var/lib")
-        left.output(PATIENCE_S)
-        assert left.logged == ""
+        with ExitStack() as stack:
+            inside = ""
+            if mounts:
+                argv = ["unshare", "--mount", "--propagation", "private", "--", "sh", "-c", f"{mounts} && {_HOLD}"]
+                holder = stack.enter_context(machine.launch(argv))
+                holder.read_until("mounted")
+                inside = f"nsenter --mount=/proc/{holder.pid}/ns/mnt -- "
+            shell = machine.type(inside + command, self.tokens[-1])
+            shell.reap(PATIENCE_S)
+            assert shell.code == 2, shell.logged
+            assert len(shell.logged.splitlines()) == 1, shell.logged
+            for look in ("ls -A /var/lib", f"{inside}find /var/lib -mindepth 1 -not -path /var/lib/gdp"):
+                left = machine.type(look)
+                left.output(PATIENCE_S)
+                assert left.logged == ""
         return shell.logged
 
 
@@ -85,17 +93,17 @@ def site() -> Iterator[Field]:
 
 
 def test_without_wireguard_a_machine_does_not_join(site: Field) -> None:
-    hidden = "mount --bind /dev/null $(command -v wireguard-go) && {}"
+    hidden = "mount --bind /dev/null $(command -v wireguard-go)"
     assert "install --no-install-recommends wireguard-go" in site.refusal(site.robot, JOIN, hidden)
 
 
 def test_without_a_tun_device_a_machine_does_not_join(site: Field) -> None:
-    text = site.refusal(site.robot, JOIN, "mount --bind /var/lib /dev/net && {}")
+    text = site.refusal(site.robot, JOIN, "mount --bind /var/lib /dev/net")
     assert "needs /dev/net/tun, which does not exist; modprobe tun" in text
 
 
 def test_without_the_right_to_make_devices_a_machine_does_not_join(site: Field) -> None:
-    text = site.refusal(site.robot, JOIN, "setpriv --bounding-set=-net_admin -- {}")
+    text = site.refusal(site.robot, f"setpriv --bounding-set=-net_admin -- {JOIN}")
     assert "not permitted; run this as root" in text
 
 
@@ -118,8 +126,7 @@ def test_a_machine_that_does_not_reach_the_border_does_not_join(site: Field) -> 
 @pytest.mark.parametrize("command", ["join", pytest.param("create", marks=pytest.mark.nightly)])
 def test_on_a_full_disk_no_directory_is_left_and_no_token_used(site: Field, command: str) -> None:
     words = JOIN if command == "join" else "gdp domain create lab --public 192.0.2.1 --listen 51821 --relay-port 0"
-    small = "mount -t tmpfs -o size=512k tmpfs /var/lib && {}; code=$?; ls -A /var/lib/gdp; exit $code"
-    text = site.refusal(site.robot, words, small)
+    text = site.refusal(site.robot, words, "mount -t tmpfs -o size=512k tmpfs /var/lib")
     assert "No space left on device" in text
     assert "free some space, then run the command again" in text
 

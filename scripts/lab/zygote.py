@@ -112,7 +112,6 @@ class Program:
                     environment[name] = value
             elif words[:-1] in (["bash", "-c"], ["bash", "-ec"]) and _PLAIN.fullmatch(words[-1]):
                 words = shlex.split(words[-1].removeprefix("exec "))
-                break
             else:
                 break
             words = words[1:] if words[:1] == ["--"] else words

@@ -188,6 +188,14 @@ def test_code_that_imports_the_project_is_forked_on_a_machine_of_a_laboratory() 
     assert Program.from_argv([*entered, "import gdprint"]) is None
 
 
+def test_what_a_shell_does_before_a_command_is_done_before_the_forked_one() -> None:
+    words = ["nsenter", "--net=/n", "--", "bash", "-c", "exec nsenter --mount=/m -- env A=b gdp join"]
+    program = Program.from_argv(words, str(_BIN))
+    assert program is not None
+    assert (program.spaces, program.environment) == (("/n", "/m"), (("A", "b"),))
+    assert program.argv[1:] == ["join"]
+
+
 @pytest.mark.skipif(Popen.zygote is None, reason="this session executes programs")
 def test_no_import_of_a_test_makes_the_session_execute_its_programs(tmp_path: Path) -> None:
     program = Program.from_argv([sys.executable, "-m", "gdp.cli.gdp"])
