@@ -205,11 +205,9 @@ class SimNetwork:
         end_s = self._now_s + duration_s
         if until is not None and until():
             return True
-        events, pop = self._events, heapq.heappop
-        while events and events[0][0] <= end_s:
-            at_s, _, action, arguments = pop(events)
-            if at_s > self._now_s:
-                self._now_s = at_s
+        while self._events and self._events[0][0] <= end_s:
+            at_s, _, action, arguments = heapq.heappop(self._events)
+            self._now_s = at_s if at_s > self._now_s else self._now_s
             if action(*arguments) is not _QUIET and until is not None and until():
                 return True
         self._now_s = end_s
@@ -267,9 +265,8 @@ class SimNetwork:
 
     def _settle(self, name: str) -> None:
         node = self._nodes[name]
-        machine, now_s = node.machine, self._now_s
-        while transmits := machine.frames_to_send(now_s):
-            machine.frames_sent(now_s)
+        while transmits := node.machine.frames_to_send(self._now_s):
+            node.machine.frames_sent(self._now_s)
             for transmit in transmits:
                 self._transmit(node, transmit)
         self._arm(name)
@@ -278,24 +275,22 @@ class SimNetwork:
         wired = node.ports.get(transmit.port)
         if wired is None:
             raise LocalError(f"no port {transmit.port}")
-        addresses = ethernet(transmit.mac, wired[1].mac)
         for frame in transmit.frames:
-            self._send(wired, addresses + frame)
+            self._send(wired, ethernet(transmit.mac, wired[1].mac) + frame)
 
     def _send(self, wired: tuple[SimLink, _End, _End], frame: bytes) -> None:
         sim_link, own, far = wired
-        now_s = self._now_s
         for tap in self.taps:
-            tap(now_s, own.node, far.node, frame)
+            tap(self._now_s, own.node, far.node, frame)
         if not sim_link.is_up or len(frame) - ETHER_BYTES > sim_link.mtu:
             self.drops[DropReason.PORT_DOWN if not sim_link.is_up else DropReason.TOO_BIG] += 1
-        elif (sim_link.free_s and sim_link.is_full(far.mac, now_s)) or (
+        elif (sim_link.free_s and sim_link.is_full(far.mac, self._now_s)) or (
             sim_link.loss and far.node != sim_link.spared and sim_link.loses(far.mac, self._random.random())
         ):
             self.lost += 1
         else:
             delay_s = sim_link.delay_s + (self._random.random() * sim_link.jitter_s if sim_link.jitter_s else 0.0)
-            left_s = sim_link.leaves_s(far.mac, len(frame), now_s)
+            left_s = sim_link.leaves_s(far.mac, len(frame), self._now_s)
             self._push(left_s + delay_s, self._arrive, sim_link, far, frame)
 
     def _arrive(self, sim_link: SimLink, end: _End, frame: bytes) -> object:
@@ -322,7 +317,6 @@ class SimNetwork:
             if isinstance(decision, Drop):
                 self.drops[decision.reason] += 1
                 return _QUIET
-        arrival = new_tuple(ReceivedFrame, (end.port, frame[6:12], frame[ETHER_BYTES:], 0.0))
-        node.machine.receive([arrival], self.now)
+        node.machine.receive([new_tuple(ReceivedFrame, (end.port, frame[6:12], frame[ETHER_BYTES:], 0.0))], self.now)
         self._settle(end.node)
         return None

@@ -7,12 +7,13 @@ import pytest
 from lab.simulation import Simulation
 from lab.topology import chain
 from tests.journeys.flows import flowing
+from tests.lanes import nightly
 
 SOURCE, READER = "s1/left", "s3/right"
 
 
 @pytest.mark.momentary("a repair takes two round trips of 60 ms; leases play no part in it")
-@pytest.mark.parametrize(("loss", "least"), [(0.01, 0.95), (0.05, 0.8)])
+@pytest.mark.parametrize(("loss", "least"), [(0.05, 0.8), *nightly((0.01, 0.95))])
 def test_best_effort_images_cross_a_lossy_uplink_of_60_ms(loss: float, least: float) -> None:
     world = Simulation(topology=chain(3), delay_s=0.03)
     assert world.run_until_attached()

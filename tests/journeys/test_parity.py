@@ -14,6 +14,7 @@ from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.trust.right import Right
 from lab.network import SimLink
+from tests.draws import IS_LONG
 from tests.journeys.flows import Flow
 from tests.journeys.test_two_paths import site
 from tests.lanes import nightly
@@ -25,6 +26,7 @@ LATE_S = ONE_WAY_S + 0.010  # after the last frame of a message, or of its parit
 STEP_S = 0.001
 RATE_BYTES_S = 12.5e6
 JPEG_BYTES, IMAGE_BYTES = 40_000, 921_600
+IMAGES = 150 if IS_LONG else 100
 
 
 @dataclass
@@ -113,7 +115,7 @@ def test_jpegs_come_within_one_way_and_10_ms(
     for fec in (False, True):
         made = camera(fec=fec)
         made.cable.loss, made.cable.burst_frames = loss, burst
-        made.stream(150, 0.15, JPEG_BYTES)
+        made.stream(IMAGES, 0.15, JPEG_BYTES)
         shares.append(made.in_time(30))
         assert bool(made.recovered()) is fec
         assert made.bytes_of[Kind.PARITY] <= 0.25 * made.bytes_of[Kind.DATA]
@@ -139,8 +141,8 @@ def test_a_reliable_topic_delivers_everything_in_order_with_fewer_repairs() -> N
     for fec in (False, True):
         made = camera(fec=fec, reliable=True)
         made.cable.loss = 0.03
-        made.stream(80, 0.15, JPEG_BYTES)
-        assert list(made.came_s[0]) == list(range(80))
+        made.stream(60, 0.15, JPEG_BYTES)
+        assert list(made.came_s[0]) == list(range(60))
         repairs.append(made.flow.publisher.protection.repairs)
         latest.append(made.in_time(20))
     assert repairs[1] < 0.4 * repairs[0]
@@ -190,8 +192,8 @@ def test_parity_ends_when_the_loss_ends() -> None:
 def test_restored_frames_count_as_lost_for_the_measurement() -> None:
     made = camera()
     made.cable.loss = 0.05
-    made.stream(150, 0.1, JPEG_BYTES)
-    assert made.recovered() > 100
+    made.stream(90, 0.1, JPEG_BYTES)
+    assert made.recovered() > 60
     assert 0.03 < made.flow.publisher.governing_paths.loss < 0.08
 
 
@@ -199,7 +201,7 @@ def test_each_of_several_readers_restores_what_it_lost_itself() -> None:
     made = camera(readers=3)
     for cable in made.reader_cables:
         cable.loss = 0.02
-    made.stream(100, 0.15, JPEG_BYTES)
+    made.stream(70, 0.15, JPEG_BYTES)
     for reader in range(3):
         assert made.recovered(reader) > 10
         assert made.in_time(30, reader) > 0.9

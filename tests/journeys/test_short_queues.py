@@ -35,7 +35,7 @@ def drawn() -> st.SearchStrategy[tuple[float, float, float, float, float]]:
 
 
 @pytest.mark.momentary("what is tried is how long single messages take")
-@draws(8)
+@draws(4, long=32)
 @given(drawn())
 @example((1.0, 0.0005, 0.1, 0.0, 0.48))  # took 16 s, or did not arrive within 40 s
 @example((1.0, 0.03, 0.1, 0.01, 0.48))

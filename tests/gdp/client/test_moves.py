@@ -8,6 +8,7 @@ import pytest
 
 from gdp.frame.codec import Kind, decode
 from tests.gdp.client.pipe import End, Pipe, publisher_of
+from tests.lanes import nightly
 
 WIDE, NARROW = 9_000, 800
 
@@ -124,7 +125,7 @@ def test_a_reader_that_missed_several_moves_follows_them_all() -> None:
     assert one.messages == other.messages == sent
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [*range(4), *nightly(*range(4, 8))])
 def test_whatever_is_lost_or_overtakes_while_paths_change_all_arrives_once_and_in_order(seed: int) -> None:
     pipe, chance = wide(seed=seed), Random(seed)
     ends = joined(pipe, b"a", b"b", b"c")
