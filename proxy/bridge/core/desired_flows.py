@@ -202,11 +202,15 @@ def _imported(
         for type_name in sorted(types):
             key = kind, local, type_name
             if key not in memo.wanted:
-                asked = choose(rules, *key)
-                name = None if asked is None else asked.overlay_name_of(local, type_name)
-                memo.wanted[key] = None if name is None else FlowSpec(False, local, type_name, name, asked)
+                memo.wanted[key] = _wanted(rules, *key)
             if (wants := memo.wanted[key]) is not None:
                 yield wants
+
+
+def _wanted(rules: Sequence[Rule], kind: Kind, local: str, type_name: str) -> FlowSpec | None:
+    """Return the flow of what local nodes ask for; None: no rule imports it."""
+    rule = choose(rules, kind, local, type_name)
+    return None if rule is None else FlowSpec(False, local, type_name, rule.overlay_name_of(local, type_name), rule)
 
 
 def _named(rules: Iterable[Rule]) -> Iterator[FlowSpec]:
