@@ -24,7 +24,7 @@ from lab.topology import chain
 pytestmark = pytest.mark.netns
 
 PATIENCE_S = 30.0
-LOOK_S = 4.0
+LOOK_S = 2.0
 KEEPALIVES = 1_000 * LOOK_S / KEEPALIVE_MS  # of one neighbour in that time
 NO_BPF = ("setpriv", "--bounding-set=-bpf,-sys_admin", "--inh-caps=-bpf,-sys_admin", "--")
 

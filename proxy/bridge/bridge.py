@@ -25,7 +25,7 @@ from gdp.sansio import Timestamps
 from gdp.trust.right import Right
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, presence_of_nodes, sign
-from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
+from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, RuleMemo, denied, exposed, imported
 from proxy.bridge.core.exclusive_control import ExclusiveControl
 from proxy.bridge.core.node_rules import Brought, FarNodes, brought, nodes_in
 from proxy.bridge.core.stream_qos import LiveQos
@@ -165,6 +165,7 @@ class Bridge:
         self.held = held
         self._me = proxy_node_name(context.member.name.to_text())
         self._dispatchers = [EndpointDispatcher(endpoint) for endpoint in endpoints]
+        self._memos = [RuleMemo() for _ in endpoints]
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._finishing: dict[Name, _Finishing] = {}
@@ -363,7 +364,7 @@ class Bridge:
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
         """Replace rules and delegations; flows with an unchanged rule continue undisturbed while they are delegated."""
-        self.rules, self.held = config, held
+        self.rules, self.held, self._memos = config, held, [RuleMemo() for _ in self._dispatchers]
         if self._context.keeper is not None:
             self._context.keeper.renew(held)
         for key, (flow_spec, flow) in list(self._flows.items()):
@@ -469,7 +470,8 @@ class Bridge:
             )
             return
         wished.add(key)
-        if key in self._flows and self._flows[key][0].rule != flow_spec.rule:
+        before = self._flows.get(key, (flow_spec,))[0]
+        if before is not flow_spec and before.rule != flow_spec.rule:
             self._change(key, flow_spec)
         if not self._is_ready(key, flow_spec, now_s):
             if key in self._flows:
@@ -558,9 +560,9 @@ class Bridge:
         expose = self._exposed_at(at)
         imports = [rule for rule in self.rules.imports if self.rules.endpoint_of(rule) == at]
         nodes = self._brought(at, expose, graph)
-        yield from exposed(expose, graph, complaints, nodes.expose)
+        yield from exposed(expose, graph, complaints, nodes.expose, self._memos[at])
         held = [*self.held.described(Right.READ), *self.held.described(Right.CALL)]
-        yield from imported(imports, graph, held, complaints, nodes.imports)
+        yield from imported(imports, graph, held, complaints, nodes.imports, self._memos[at])
 
     def _exposed_at(self, at: int) -> list[Rule]:
         return [rule for rule in self.rules.expose if self.rules.endpoint_of(rule) == at]

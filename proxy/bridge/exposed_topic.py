@@ -72,7 +72,7 @@ class ExposedTopic:
         self.last_s: float | None = None
         self._channels: tuple[Channel, ...] = ()  # as the endpoint describes them
         self._encoders: list[MessageEncoder] = []
-        self.local_publishers = len(ends)
+        self._ends, self.local_publishers = ends, len(ends)
         self._depth_probe: DepthProbe | None = None
         self._keys = {end.key for end in ends}
         self._new_encoder = encoders_of(flow_spec.rule)
@@ -89,7 +89,9 @@ class ExposedTopic:
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local publishers."""
-        self.local_publishers = len(ends)
+        if ends == self._ends:
+            return
+        self._ends, self.local_publishers = ends, len(ends)
         probe, keys = self._depth_probe, {end.key for end in ends}
         is_other, self._keys = keys != self._keys, keys
         if is_other and probe is not None:

@@ -6,6 +6,7 @@ Sans-I/O. A name that no rule matches stays local. Concrete rules come before pa
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from gdp.metadata import Metadata
@@ -23,6 +24,7 @@ _SHOWS: Final[dict[Kind, Role]] = {"topic": Role.PUBLISHES, "service": Role.SERV
 _WANTS: Final[dict[Kind, Role]] = {"topic": Role.SUBSCRIBES, "service": Role.CALLS, "action": Role.CALLS}
 
 _PLAIN: Final[tuple[Kind, ...]] = ("topic", "service")
+_KEPT, _KEPT_MIN = 4, 1_024  # names in a ``RuleMemo``: of each that the graph shows, and above
 
 
 class FlowSpec(NamedTuple):
@@ -59,6 +61,30 @@ class DeniedName(NamedTuple):
     pattern: str
 
 
+_Exposed = tuple[tuple[FlowSpec, ...], ConfigProblem | None]
+
+
+@dataclass(slots=True)
+class RuleMemo:
+    """What the rules of one endpoint mean for each name, found once: a refresh of a large graph asks for all of them.
+
+    Attributes:
+        exposed: by kind, local name and the types that it shows.
+        wanted: by kind, local name and type.
+        held: by overlay name.
+    """
+
+    exposed: dict[tuple[Kind, str, frozenset[str]], _Exposed] = field(default_factory=dict)
+    wanted: dict[tuple[Kind, str, str], FlowSpec | None] = field(default_factory=dict)
+    held: dict[Name, FlowSpec | None] = field(default_factory=dict)
+
+    def trim(self, names: int) -> None:
+        """Forget all if it has far more than a graph shows, of which names have gone."""
+        for each in self.exposed, self.wanted:
+            if len(each) > _KEPT * names + _KEPT_MIN:
+                each.clear()
+
+
 def denied(rules: Sequence[Rule], graph: Graph, *, is_exposed: bool) -> Iterator[DeniedName]:
     """Yield the denied names of one direction: those of the graph, and those that a rule states."""
     shown = {(rule.kind, rule.local) for rule in rules if rule.is_denied}
@@ -71,35 +97,54 @@ def denied(rules: Sequence[Rule], graph: Graph, *, is_exposed: bool) -> Iterator
 
 
 def exposed(
-    rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem], brought: Sequence[Rule] = ()
+    rules: Sequence[Rule],
+    graph: Graph,
+    complaints: list[ConfigProblem],
+    brought: Sequence[Rule] = (),
+    memo: RuleMemo | None = None,
 ) -> Iterator[FlowSpec]:
     """Yield a flow for each local publisher or server that a rule exposes, and for the nodes of each rule.
 
     Args:
         complaints: problems are added to them.
         brought: the rules of what nodes have; they apply where no other one does.
+        memo: of these rules; None: a new one.
     """
+    memo = RuleMemo() if memo is None else memo
     by_node = _by_name(brought)
     of_nodes = {id(each): each for each, _ in nodes_in(rules, graph).values()}
     for each in of_nodes.values():  # one for all nodes of a pattern
         yield FlowSpec(True, each.local, NODE_TYPE, each.overlay_name_of(each.local, NODE_TYPE), each)
-    for (kind, local), types in _shown(graph, _SHOWS).items():
-        fitting = rules if choose(rules, kind, local) is not None else by_node.get((kind, local), ())
-        first = choose(fitting, kind, local)
-        if first is None:
-            continue
-        wanted: dict[int, tuple[str, Rule]] = {}  # first type of each rule: topics of a recording may have several
-        for type_name in sorted(types):
-            rule = choose(fitting, kind, local, type_name)
-            if rule is not None:
-                wanted.setdefault(id(rule), (type_name, rule))
-        if len(wanted) < len(types):
-            said = f"; the rule says {first.type_name}" if first.type_name else ""
-            complaints.append(
-                ConfigProblem(local, Fault.OTHER_TYPE, f"local nodes use {', '.join(sorted(types))}{said}")
-            )
-        for type_name, rule in wanted.values():
-            yield FlowSpec(True, local, type_name, rule.overlay_name_of(local, type_name), rule)
+    shown = _shown(graph, _SHOWS)
+    memo.trim(len(shown))
+    for (kind, local), types in shown.items():
+        key, of_node = (kind, local, frozenset(types)), by_node.get((kind, local))
+        found = memo.exposed.get(key) if of_node is None else _exposed(rules, of_node, *key)
+        if found is None:
+            found = memo.exposed[key] = _exposed(rules, (), *key)
+        flow_specs, problem = found
+        if problem is not None:
+            complaints.append(problem)
+        yield from flow_specs
+
+
+def _exposed(rules: Sequence[Rule], brought: Sequence[Rule], kind: Kind, local: str, types: frozenset[str]) -> _Exposed:
+    """Return the flows of one local name, and its problem."""
+    fitting = rules if choose(rules, kind, local) is not None else brought
+    first = choose(fitting, kind, local)
+    if first is None:
+        return (), None
+    wanted: dict[int, tuple[str, Rule]] = {}  # first type of each rule: topics of a recording may have several
+    for type_name in sorted(types):
+        rule = choose(fitting, kind, local, type_name)
+        if rule is not None:
+            wanted.setdefault(id(rule), (type_name, rule))
+    problem = None
+    if len(wanted) < len(types):
+        said = f"; the rule says {first.type_name}" if first.type_name else ""
+        problem = ConfigProblem(local, Fault.OTHER_TYPE, f"local nodes use {', '.join(sorted(types))}{said}")
+    found = wanted.values()
+    return tuple(FlowSpec(True, local, of, rule.overlay_name_of(local, of), rule) for of, rule in found), problem
 
 
 def imported(
@@ -108,16 +153,20 @@ def imported(
     held: Iterable[tuple[Metadata, Name]],
     complaints: list[ConfigProblem],
     brought: Sequence[Rule] = (),
+    memo: RuleMemo | None = None,
 ) -> Iterator[FlowSpec]:
     """Yield a flow for each name to import: by concrete rules, by held delegations, by requests of local nodes.
 
     Args:
         brought: the rules of what nodes have; they apply where no other one does.
+        memo: of these rules and delegations; None: a new one.
     """
     seen: set[Name] = set()
     wanted = _shown(graph, _WANTS)
     had: dict[tuple[Kind, str], set[str]] = {}
-    for flow_spec in (*_imported(rules, wanted, held), *_named(brought)):
+    memo = RuleMemo() if memo is None else memo
+    memo.trim(len(wanted))
+    for flow_spec in (*_imported(rules, wanted, held, memo), *_named(brought)):
         had.setdefault((flow_spec.rule.kind, flow_spec.local), set()).add(flow_spec.type_name)
         if flow_spec.name not in seen:
             seen.add(flow_spec.name)
@@ -130,7 +179,10 @@ def imported(
 
 
 def _imported(
-    rules: Sequence[Rule], wanted: Mapping[tuple[Kind, str], set[str]], held: Iterable[tuple[Metadata, Name]]
+    rules: Sequence[Rule],
+    wanted: Mapping[tuple[Kind, str], set[str]],
+    held: Iterable[tuple[Metadata, Name]],
+    memo: RuleMemo,
 ) -> Iterator[FlowSpec]:
     held = list(held)
     names = {name for _, name in held}
@@ -140,14 +192,25 @@ def _imported(
         if flow_spec.name in names or not is_in_pattern:
             yield flow_spec
     for metadata, name in held:
-        found = matching.imported(rules, name, metadata)
-        if found is not None:
-            yield FlowSpec(False, found[1], str(metadata["type"]), name, found[0])
+        if name not in memo.held:
+            found = matching.imported(rules, name, metadata)
+            of_rule = None if found is None else FlowSpec(False, found[1], str(metadata["type"]), name, found[0])
+            memo.held[name] = of_rule
+        if (has := memo.held[name]) is not None:
+            yield has
     for (kind, local), types in wanted.items():
         for type_name in sorted(types):
-            asked = choose(rules, kind, local, type_name)
-            if asked is not None:
-                yield FlowSpec(False, local, type_name, asked.overlay_name_of(local, type_name), asked)
+            key = kind, local, type_name
+            if key not in memo.wanted:
+                memo.wanted[key] = _wanted(rules, *key)
+            if (wants := memo.wanted[key]) is not None:
+                yield wants
+
+
+def _wanted(rules: Sequence[Rule], kind: Kind, local: str, type_name: str) -> FlowSpec | None:
+    """Return the flow of what local nodes ask for; None: no rule imports it."""
+    rule = choose(rules, kind, local, type_name)
+    return None if rule is None else FlowSpec(False, local, type_name, rule.overlay_name_of(local, type_name), rule)
 
 
 def _named(rules: Iterable[Rule]) -> Iterator[FlowSpec]:

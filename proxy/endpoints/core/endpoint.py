@@ -13,11 +13,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from enum import Enum
+from functools import lru_cache
 from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 from proxy.serial.channel import Channel, Qos, RosVersion, Service
 
 _PROXY_NODE: Final = re.compile(r"gdp_proxy_[0-9a-f]{12}(_[0-9a-z_]*)?\Z")
+_NODES_MAX: Final = 4_096  # names of nodes that are kept with what they are
 
 
 class Role(Enum):
@@ -240,6 +242,7 @@ def proxy_node_name(name_hex: str, suffix: str = "") -> str:
     return f"gdp_proxy_{name_hex[:12]}{'_' + suffix if suffix else ''}"
 
 
+@lru_cache(_NODES_MAX)
 def is_proxy_node(node: str) -> bool:
     """Return whether a node (fully qualified or not) is the virtual node of a proxy."""
     return _PROXY_NODE.match(node.rpartition("/")[2]) is not None
