@@ -57,7 +57,6 @@ class Uploader:
         end: int,
         now_s: float,
         windows: Windows | None = None,
-        most_bytes: int = BATCH_BYTES,
         *,
         is_chosen: bool = True,
     ) -> HolderRequest | Span | None:
@@ -67,7 +66,6 @@ class Uploader:
             begin: offset of the first byte here.
             end: behind the last byte on the disk here.
             windows: what stands in none of them is left out; None: everything is uploaded.
-            most_bytes: of one request.
             is_chosen: records go to this holder; another one fetches them from it, and is asked what it has.
         """
         if self._is_under_way or now_s < self._retry_s:
@@ -92,7 +90,7 @@ class Uploader:
         if self._head >= end:
             return None
         self._is_under_way = True
-        return Span(self._head, min(end - self._head, most_bytes))
+        return Span(self._head, min(end - self._head, BATCH_BYTES))
 
     def append(self, offset: int, data: bytes) -> HolderRequest:
         """Return the request with records that were read."""

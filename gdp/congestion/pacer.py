@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-_DELAY_MOST_S: Final = 0.25  # by the pace; longer only if one frame takes longer
+DELAY_MOST_S: Final = 0.25  # by the pace; longer only if one frame takes longer
 _CREDIT_SHARE, _CREDIT_MOST_S = 0.125, 0.01  # of a round trip; less than a time slice loses the pace on a busy core
 
 
@@ -38,6 +38,6 @@ class Pacer:
         """
         from_s = now_s - self.credit_s if self.is_paced else now_s
         due_s = (self.due_s if self.due_s > from_s else from_s) + size / self.bytes_s
-        if due_s > now_s + _DELAY_MOST_S:
-            due_s = min(due_s, now_s + max(_DELAY_MOST_S, self.mtu / self.bytes_s))
+        if due_s > now_s + DELAY_MOST_S:
+            due_s = min(due_s, now_s + max(DELAY_MOST_S, self.mtu / self.bytes_s))
         self.due_s = due_s
