@@ -92,7 +92,8 @@ class ReaderPath:
         if next_s < now_s - BURST_S:
             burst_s = max(controller.pace.credit_s, BURST_S) if controller.pace.is_paced else BURST_S
             next_s = next_s if next_s > now_s - burst_s else now_s - burst_s
-        paced = int((now_s + BURST_S - next_s) * pace) + mtu
+        paced = int((now_s + BURST_S - next_s) * pace) + controller.burst_frames * mtu
+        paced = paced if paced > mtu else mtu
         return free if free < paced else paced
 
     def next_send_s(self) -> float:
@@ -276,7 +277,7 @@ class ReaderPaths:
         """Delay what follows to all but these readers by the time that so many bytes take."""
         for reader, path in self._paths.items():
             if reader not in readers:
-                path.controller.pace.charge(size, now_s)
+                path.controller.pace.charge_other(size, now_s)
 
     def get(self, reader: bytes) -> ReaderPath | None:
         """Return the path to a reader node, or None."""

@@ -36,7 +36,7 @@ class SendOptions:
         priority: what goes first; ``high`` to ``bulk`` share the path 16 : 8 : 4 : 2, times ``weight``;
             ``background`` takes what these leave, for as long as a publisher exists.
         max_bits_s: most bits of frames per second; None: what the path carries.
-        fec: messages are sent redundantly against loss that is measured.
+        fec: messages are sent redundantly against loss that is measured; not so at the priority ``background``.
         history_bytes: most bytes that a latched topic keeps for late joiners; None: its depth alone counts.
         history_age_s: longest time that a latched message waits for late joiners; None: its depth alone counts.
         repairs: lost parts of a best-effort message are sent again while that can be in time.
@@ -62,6 +62,11 @@ class SendOptions:
     def is_background(self) -> bool:
         """Return whether messages leave only when no others do, as LEDBAT (RFC 6817) does."""
         return self.priority == "background"
+
+    @property
+    def is_redundant(self) -> bool:
+        """Return whether messages are sent redundantly; those that may wait are repaired instead."""
+        return self.fec and not self.is_background
 
     @property
     def share(self) -> int:

@@ -16,7 +16,7 @@ them stands in a queue.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import ClassVar, Final
 
 from gdp.congestion.controller import PathController
 from gdp.congestion.delivery_rate import Flight
@@ -67,10 +67,11 @@ class ScavengingController(PathController):
         pace: it is charged with the frames of all paths of the participant.
     """
 
+    burst_frames: ClassVar[int] = 0
     pace: CommonPacer
 
     def __init__(self, mtu: int) -> None:
-        self._bytes_s, self._own = 0.0, 0
+        self._bytes_s = 0.0
         super().__init__(mtu)
         self.pace = CommonPacer(mtu)
         self._set_limits()
@@ -79,7 +80,7 @@ class ScavengingController(PathController):
         super()._start()
         self._bytes_s, self._ceiling = 0.0, float("inf")
         self._reduced_s = self._tried_s = self._raised_s = self._begun_s = float("-inf")
-        self._begun_charged = self._begun_own = 0
+        self._begun_charged = self._begun_others = 0
         self._try, self._proven = _TRY, 0.0
 
     def _set_limits(self) -> None:
@@ -93,7 +94,6 @@ class ScavengingController(PathController):
     def sent(self, size: int, now_s: float, frames: int = 1) -> Flight:
         """Count and return a flight of so many bytes and frames, which leaves now."""
         self.pace.left_s = now_s
-        self._own += size
         return super().sent(size, now_s, frames)
 
     def timed_out(self, now_s: float) -> None:
@@ -115,7 +115,7 @@ class ScavengingController(PathController):
         if self._raised_s > self._reduced_s:
             grew_s = min(max(newest.sent_s - self._raised_s, queue_s), grew_s)
         carried = self._bytes_s / (1 + queue_s / grew_s)
-        if self._own - self._begun_own == self.pace.charged - self._begun_charged:
+        if self.pace.others == self._begun_others:
             carried = min(carried, model.bytes_s or carried)
         self._reduce(max(carried, self._proven), now_s)
         self.pace.pause(max(queue_s, self.rate.inflight / carried - model.base_rtt_s), now_s)
@@ -131,7 +131,7 @@ class ScavengingController(PathController):
 
     def _begin(self, now_s: float) -> None:
         """Begin to see what the present rate does."""
-        self._begun_s, self._begun_charged, self._begun_own = now_s, self.pace.charged, self._own
+        self._begun_s, self._begun_charged, self._begun_others = now_s, self.pace.charged, self.pace.others
         self._lost_frames = self._round_frames = 0
 
     def _end_round(self, now_s: float, *, is_used: bool) -> None:
@@ -143,11 +143,11 @@ class ScavengingController(PathController):
         seen_s = self.confirmed_sent_s - self._begun_s
         if not self._bytes_s or seen_s <= self._shows_s(_RETURN):
             return
-        charged, own, span_s = self.pace.charged - self._begun_charged, self._own - self._begun_own, now_s - self._begun_s
+        charged, span_s = self.pace.charged - self._begun_charged, now_s - self._begun_s
         if charged < _USED * self._bytes_s * span_s:
             self._begin(now_s)
         else:
-            self._grow(charged / span_s, seen_s, now_s, is_alone=charged == own)
+            self._grow(charged / span_s, seen_s, now_s, is_alone=self.pace.others == self._begun_others)
 
     def _grow(self, charged_s: float, seen_s: float, now_s: float, *, is_alone: bool) -> None:
         """Raise the rate; ``charged_s``: bytes of all frames a second, ``seen_s``: for how long this one was tried."""

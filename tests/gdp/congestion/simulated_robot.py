@@ -119,6 +119,8 @@ class SimulatedRobot:
         self._cloud_wakes_s = float("inf")
         self.queue_s: list[tuple[float, float]] = []
         self.sent_bytes: list[tuple[float, int]] = []
+        self._queued = deque[tuple[int, int]]()  # when each background frame has left the link, and its bytes
+        self.ahead_s: list[tuple[float, float]] = []  # of each other frame: what background frames before it take
         self.readers = {label: reader_of(label) for label in {b"cloud", *(each.reader for each in streams)}}
         self.reader = self.readers[b"cloud"]
         self.topics = [self._topic(each) for each in streams]
@@ -274,9 +276,20 @@ class SimulatedRobot:
 
     def _forward(self, frames: list[bytes]) -> None:
         for frame in frames:
-            due_ns = self._offer(len(frame))
-            if due_ns is not None and not self._topic_of(frame).loss.is_lost():
+            topic, due_ns = self._topic_of(frame), self._offer(len(frame))
+            self._note_ahead(topic, len(frame), due_ns)
+            if due_ns is not None and not topic.loss.is_lost():
                 self.at(due_ns / 1e9, lambda frame=frame: self._come(frame))  # type: ignore[misc]
+
+    def _note_ahead(self, topic: Topic, size: int, due_ns: int | None) -> None:
+        """Note how much of the queue that a frame finds is background's."""
+        leaves_ns = round((self.now_s + self.rtt_s / 2) * 1e9)
+        while self._queued and self._queued[0][0] <= leaves_ns:
+            self._queued.popleft()
+        if topic.stream.priority != "background":
+            self.ahead_s.append((self.now_s, sum(size for _, size in self._queued) * 8 / self.bits_s))
+        elif due_ns is not None:
+            self._queued.append((due_ns, size))
 
     def _come(self, frame: bytes) -> None:
         topic = self._topic_of(frame)
