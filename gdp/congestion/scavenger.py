@@ -28,6 +28,7 @@ from gdp.limits import REPORT_DELAY_S
 
 _LEAST_FRAMES: Final = 2
 _SHARE: Final = 0.95  # of what the path carries
+_QUEUE_DELAYS: Final = 4  # of the longest queue that live traffic may have
 _AHEAD: Final = 1.5  # times what is under way at this rate, so that late reports cost nothing
 _RETURN, _TRY, _TRY_LEAST = 0.5, 0.05, 0.01  # increase of the rate
 _USED: Final = 0.75  # of the rate left, so the path was tried
@@ -37,7 +38,7 @@ _LOSS, _LOSS_FRAMES = 0.2, 50  # the queue is shorter than the delay that would 
 
 
 class CommonPacer(Pacer):
-    """Pace of all frames of a participant, of which those of one path are to wait.
+    """Pace of all frames of a participant, of which those of one path are to wait until the others have passed the link.
 
     Attributes:
         charged: bytes so far.
@@ -47,17 +48,27 @@ class CommonPacer(Pacer):
     def __init__(self, mtu: int) -> None:
         super().__init__(mtu)
         self.charged = 0
-        self.left_s = float("-inf")
+        self.left_s = self._at_s = float("-inf")
+        self._queued = 0.0  # bytes at ``_at_s``; below 0: what a late sender may catch up
 
     def charge(self, size: int, now_s: float) -> None:
         """Delay what follows by the time that so many bytes take, within ``DELAY_MOST_S`` after the last frame."""
-        super().charge(size, now_s)
         self.charged += size
-        self.due_s = min(self.due_s, max(self.left_s + DELAY_MOST_S, now_s))
+        if self.bytes_s < float("inf"):
+            least = -self.credit_s * self.bytes_s if self.is_paced else 0.0
+            self._queue(max(self.left_bytes(now_s), least) + size, now_s)
 
     def pause(self, pause_s: float, now_s: float) -> None:
         """Let nothing leave for a time."""
-        self.due_s = max(self.due_s, now_s + min(pause_s, DELAY_MOST_S))
+        self._queue(max(self.left_bytes(now_s), pause_s * self.bytes_s), now_s)
+
+    def left_bytes(self, now_s: float) -> float:
+        """Return how many bytes may stand in the queue of the link."""
+        return self._queued - (now_s - self._at_s) * self.bytes_s
+
+    def _queue(self, size: float, now_s: float) -> None:
+        self._queued, self._at_s = min(size, _QUEUE_DELAYS * DELAY_MOST_S * self.bytes_s), now_s
+        self.due_s = min(now_s + self._queued / self.bytes_s, max(self.left_s + DELAY_MOST_S, now_s))
 
 
 class ScavengingController(PathController):
@@ -79,7 +90,7 @@ class ScavengingController(PathController):
     def _start(self) -> None:
         super()._start()
         self._bytes_s, self._ceiling = 0.0, float("inf")
-        self._reduced_s = self._tried_s = self._raised_s = self._begun_s = float("-inf")
+        self._unseen_s = self._reduced_s = self._tried_s = self._raised_s = self._begun_s = float("-inf")
         self._begun_charged = self._begun_others = 0
         self._try, self._proven = _TRY, 0.0
 
@@ -93,12 +104,15 @@ class ScavengingController(PathController):
 
     def sent(self, size: int, now_s: float, frames: int = 1) -> Flight:
         """Count and return a flight of so many bytes and frames, which leaves now."""
+        if self._ceiling < float("inf") and self.pace.left_bytes(now_s) > self._mtu:
+            self._unseen_s = now_s  # it joins a queue of others
         self.pace.left_s = now_s
         return super().sent(size, now_s, frames)
 
     def timed_out(self, now_s: float) -> None:
         """Start again with two frames, and then half of the rate: the path was gone, and may be the same."""
-        bytes_s, ceiling = self._bytes_s / 2, self._ceiling
+        bytes_s, ceiling = self._bytes_s, self._ceiling
+        bytes_s *= 1.0 if self.model.rtt_s is None else 0.5  # once, however long it is gone
         super().timed_out(now_s)
         self._bytes_s, self._ceiling = bytes_s, ceiling
         self._set_limits()
@@ -109,15 +123,15 @@ class ScavengingController(PathController):
     def _adapt(self, size: int, newest: Flight, now_s: float) -> None:
         del size
         model = self.model
-        if newest.sent_s <= self._reduced_s or model.queue_s * self._bytes_s <= self._mtu:
+        if newest.sent_s <= self._unseen_s or model.queue_s * self._bytes_s <= self._mtu:
             return
         queue_s, grew_s = model.standing_s - model.base_rtt_s, max(_TRIPS * model.base_rtt_s, REPORT_DELAY_S)
         if self._raised_s > self._reduced_s:
             grew_s = min(max(newest.sent_s - self._raised_s, queue_s), grew_s)
         carried = self._bytes_s / (1 + queue_s / grew_s)
         if self.pace.others == self._begun_others:
-            carried = min(carried, model.bytes_s or carried)
-        self._reduce(max(carried, self._proven), now_s)
+            carried = min(carried, model.bytes_s / (1 - model.loss) or carried)
+        self._reduce(max(carried, _SHARE * self._proven), now_s)
         self.pace.pause(max(queue_s, self.rate.inflight / carried - model.base_rtt_s), now_s)
 
     def _reduce(self, carried: float, now_s: float) -> None:
@@ -125,7 +139,7 @@ class ScavengingController(PathController):
         is_reached = self._bytes_s >= _REACHED * self._ceiling or self._ceiling == float("inf")
         self._ceiling = carried if is_reached else (self._ceiling + carried) / 2
         self._bytes_s, self._try, self._proven = max(_SHARE * carried, self._mtu / DELAY_MOST_S), _TRY, 0.0
-        self._reduced_s = self._tried_s = now_s
+        self._unseen_s = self._reduced_s = self._tried_s = now_s
         self._begin(now_s)
         self._signal(Signal.PATH_FULL, now_s)
 
@@ -141,7 +155,7 @@ class ScavengingController(PathController):
             self._reduce(self._bytes_s * (1 - self._lost_frames / self._round_frames), now_s)
             return
         seen_s = self.confirmed_sent_s - self._begun_s
-        if not self._bytes_s or seen_s <= self._shows_s(_RETURN):
+        if not self._bytes_s or self.confirmed_sent_s <= self._unseen_s or seen_s <= self._shows_s(_RETURN):
             return
         charged, span_s = self.pace.charged - self._begun_charged, now_s - self._begun_s
         if charged < _USED * self._bytes_s * span_s:
