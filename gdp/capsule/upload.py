@@ -18,6 +18,7 @@ from gdp.names import Name
 from gdp.requests import Backoff
 
 _FAILED: Final = Backoff(RETRY_S, MINUTE_S)
+_LEAST_BYTES: Final = 16 << 10  # of a request, where live traffic leaves little of the path within its time limit
 _FAULTS_MAX: Final = 15  # of those that nothing has read
 
 
@@ -46,6 +47,7 @@ class Uploader:
         self._retry_s = -NEVER_S
         self._failures = 0  # in a row
         self._is_chosen = True
+        self._most_bytes = BATCH_BYTES  # of one request
         self.confirmed = 0
         self.is_refused = False
         self.missing_bytes = 0
@@ -90,7 +92,7 @@ class Uploader:
         if self._head >= end:
             return None
         self._is_under_way = True
-        return Span(self._head, min(end - self._head, BATCH_BYTES))
+        return Span(self._head, min(end - self._head, self._most_bytes))
 
     def append(self, offset: int, data: bytes) -> HolderRequest:
         """Return the request with records that were read."""
@@ -113,6 +115,7 @@ class Uploader:
             self._head = None
             return
         self.confirmed, self._head = head, max(head, answer.offset)
+        self._most_bytes = min(2 * self._most_bytes, BATCH_BYTES)
         if not self._is_chosen:
             self._retry_s = now_s + POLL_S
 
@@ -120,6 +123,7 @@ class Uploader:
         """Note that a request failed: the holder is asked for its head again after a while."""
         self._note(reason)
         self.is_refused = True
+        self._most_bytes = max(self._most_bytes // 2, _LEAST_BYTES)
         self._failures += 1
         self._is_under_way, self._head, self._retry_s = False, None, now_s + _FAILED.pause_s(self._failures)
 

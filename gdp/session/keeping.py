@@ -26,7 +26,7 @@ from gdp.crypto.envelope import Sealed
 from gdp.crypto.identity import Identity
 from gdp.due_queue import earliest
 from gdp.errors import GdpError, StoreError
-from gdp.intervals import MINUTE_S, PACE_S, SCHEDULED_S, TICK_S
+from gdp.intervals import PACE_S, SCHEDULED_S, TICK_S
 from gdp.limits import WINDOW_BYTES
 from gdp.names import Name
 from gdp.sansio import Timestamps
@@ -50,9 +50,8 @@ class _Waiting(NamedTuple):
 
 
 def _asked(client: ClientCore, request: HolderRequest, now_s: float) -> Call:
-    """Return the call, begun now, that asks a holder; live traffic may leave little of the path to records."""
-    timeout_s = MINUTE_S if request.data else CALL_TIMEOUT_S
-    call = Call(payload=request.to_cbor(), timeout_s=timeout_s, replication=_ONE)
+    """Return the call, begun now, that asks a holder."""
+    call = Call(payload=request.to_cbor(), timeout_s=CALL_TIMEOUT_S, replication=_ONE)
     client.begin(call, now_s)
     return call
 
