@@ -205,7 +205,6 @@ class SendScheduler:
                 publisher.governing_paths.note_idle()  # the path could carry more than there is
         return frames
 
-
     def _charge(self, publisher: Publisher, frames: list[bytes], now_s: float) -> None:
         """Let what is to wait wait for the frames of others; its own count on their paths already."""
         if frames and self._background and (publisher.is_background or publisher.governing_paths.is_far):

@@ -9,8 +9,8 @@ them stands in a queue.
   is common to them. So while a queue of live frames may stand at the bottleneck, no frame of this controller leaves.
 - **Traffic of others.** A queueing delay above the noise of programs and a frame pauses it until the queue is over,
   and lowers the rate to what the growth of the queue shows.
-- **Increase.** Below the rate at which a queue grew last it returns fast. Above it, it tries a little more now and then,
-  and more while nothing else is sent.
+- **Increase.** Below the rate at which a queue grew last it returns fast. Above it, it tries a little more now
+  and then, and more while nothing else is sent.
 - **Starvation.** A frame may leave each ``DELAY_MOST_S``, else nothing would be measured.
 """
 
@@ -34,11 +34,12 @@ _RETURN, _TRY, _TRY_LEAST = 0.5, 0.05, 0.01  # increase of the rate
 _USED: Final = 0.75  # of the rate left, so the path was tried
 _TRIPS: Final = 4  # in which a queue has grown, at most
 _REACHED: Final = 0.9
+_LOST_MOST: Final = 0.5
 _LOSS, _LOSS_FRAMES = 0.2, 50  # the queue is shorter than the delay that would show it
 
 
 class CommonPacer(Pacer):
-    """Pace of all frames of a participant, of which those of one path are to wait until the others have passed the link.
+    """Pace of all frames of a participant; those of one path wait until the others have passed the link.
 
     Attributes:
         charged: bytes so far.
@@ -130,7 +131,7 @@ class ScavengingController(PathController):
             grew_s = min(max(newest.sent_s - self._raised_s, queue_s), grew_s)
         carried = self._bytes_s / (1 + queue_s / grew_s)
         if self.pace.others == self._begun_others:
-            carried = min(carried, model.bytes_s / (1 - model.loss) or carried)
+            carried = min(carried, model.bytes_s / (1 - min(model.loss, _LOST_MOST)) or carried)
         self._reduce(max(carried, _SHARE * self._proven), now_s)
         self.pace.pause(max(queue_s, self.rate.inflight / carried - model.base_rtt_s), now_s)
 

@@ -63,9 +63,7 @@ class Link:
         streams: list[Stream] = []
         if live:
             size = max(int(self.bytes_s * self.image / IMAGE_HZ), 100)
-            streams.append(
-                Stream("image", size, 1 / IMAGE_HZ, on_s=self.on_s, off_s=self.off_s, begin_s=begin_s)
-            )
+            streams.append(Stream("image", size, 1 / IMAGE_HZ, on_s=self.on_s, off_s=self.off_s, begin_s=begin_s))
             streams.append(Stream("cmd", 60, 1 / CMD_HZ, is_urgent=True, begin_s=begin_s))
             if self.pulse:
                 streams.append(Stream("pulse", int(self.bytes_s * self.pulse), 1.0, begin_s=begin_s + 0.45))
@@ -108,7 +106,9 @@ def check(link: Link) -> None:
         for name in ("image", "cmd"):
             for share in (0.5, 0.99):
                 was_s, is_s = (robot.age_quantile(name, begin_s, share) for robot in (alone, both))
-                note(f"{name} {share}: {1e3 * was_s:.1f} to {1e3 * is_s:.1f}, at most {1e3 * (1.1 * was_s + more_s):.1f}")
+                note(
+                    f"{name} {share}: {1e3 * was_s:.1f} to {1e3 * is_s:.1f}, at most {1e3 * (1.1 * was_s + more_s):.1f}"
+                )
                 if is_s > 1.1 * was_s + more_s:
                     late.append((name, share, was_s, is_s))
     assert max(found) <= 0.1 * link.delay_s + more_s
@@ -135,6 +135,10 @@ MBITS = st.floats(-0.3, 2.0 if IS_LONG else 1.0).map(lambda power: 10**power)
     )
 )
 @example(Link(10.0, 0.03))
+@example(
+    Link(1.32, 0.05, image=0.09, pulse=0.12)
+)  # two frames left at once; a rate that was too high counted as proven
+@example(Link(0.92, 0.166, fifo_s=0.4, loss=0.05, image=0.38, on_s=3.2, off_s=1.3))  # parity left in bursts
+@example(Link(3.2, 0.151, loss=0.012, image=0.48, pulse=0.1))  # the frame each 250 ms emptied the virtual queue
 def test_live_traffic_is_as_fresh_as_alone_and_background_takes_the_path_that_is_free(link: Link) -> None:
     check(link)
-
