@@ -15,7 +15,6 @@ from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.names import ZERO, Name
 
 BATCH_BYTES: Final = 512 << 10  # of records in one request or answer
-YIELDING_BYTES: Final = 16 << 10  # ... in one request next to live traffic
 LISTED_MAX: Final = 1_024
 SYNCED_MAX: Final = 64  # capsules that one request finds different
 

@@ -19,6 +19,7 @@ from gdp.names import Name
 from gdp.requests import Backoff
 
 _FAILED: Final = Backoff(RETRY_S, MINUTE_S)
+_LEAST_BYTES: Final = 16 << 10  # of a request, where live traffic leaves little of the path within its time limit
 _FAULTS_MAX: Final = 15  # of those that nothing has read
 
 
@@ -48,6 +49,7 @@ class Uploader:
         self._retry_s = -NEVER_S
         self._failures = 0  # in a row
         self._is_chosen = True
+        self._most_bytes = BATCH_BYTES  # of one request
         self.confirmed = 0
         self.is_refused = False
         self.missing_bytes = 0
@@ -59,7 +61,6 @@ class Uploader:
         end: int,
         now_s: float,
         windows: Windows | None = None,
-        most_bytes: int = BATCH_BYTES,
         *,
         is_chosen: bool = True,
     ) -> HolderRequest | Span | None:
@@ -69,7 +70,6 @@ class Uploader:
             begin: offset of the first byte here.
             end: behind the last byte on the disk here.
             windows: what stands in none of them is left out; None: everything is uploaded.
-            most_bytes: of one request.
             is_chosen: records go to this holder; another one fetches them from it, and is asked what it has.
         """
         if self._is_under_way or now_s < self._retry_s:
@@ -95,7 +95,7 @@ class Uploader:
         if self._head >= end:
             return None
         self._is_under_way = True
-        return Span(self._head, min(end - self._head, most_bytes))
+        return Span(self._head, min(end - self._head, self._most_bytes))
 
     def append(self, offset: int, data: bytes) -> HolderRequest:
         """Return the request with records that were read."""
@@ -121,6 +121,7 @@ class Uploader:
             return
         self.confirmed, self._held = head, max(head, answer.offset)
         self._head = self._held
+        self._most_bytes = min(2 * self._most_bytes, BATCH_BYTES)
         if not self._is_chosen:
             self._retry_s = now_s + POLL_S
 
@@ -128,6 +129,7 @@ class Uploader:
         """Note that a request failed: the holder is asked for its head again after a while."""
         self._note(reason)
         self.is_refused = True
+        self._most_bytes = max(self._most_bytes // 2, _LEAST_BYTES)
         self._failures += 1
         self._is_under_way, self._head, self._retry_s = False, None, now_s + _FAILED.pause_s(self._failures)
 

@@ -334,7 +334,7 @@ class Participant:
         writing, own_s = publications.timers, publications.reader_paths.due_s
         writing_s = writing.next_due() if writing.touched else writing.due_s
         reading_s = reading.next_due() if reading.touched else reading.due_s
-        for each_s in (writing_s, reading_s, self._scheduler.due_s):
+        for each_s in (writing_s, reading_s, self._scheduler.due_s, publications.background_paths.due_s):
             own_s = each_s if each_s < own_s else own_s
         for requests in publications.holding:
             own_s = min(own_s, requests.get_timer())
@@ -367,8 +367,9 @@ class Participant:
         """Note that the frames returned last are sent now: sealing them took time."""
         if self._scheduler.uncounted is not None:
             self._scheduler.count_sent()
-        if self.publications.reader_paths.leaving:
-            self.publications.reader_paths.frames_sent(now_s)
+        for paths in (self.publications.reader_paths, self.publications.background_paths):
+            if paths.leaving:
+                paths.frames_sent(now_s)
 
     def poll_messages(self) -> list[Message]:
         """Return, once, the messages that arrived, in order within each writer proxy."""

@@ -71,7 +71,7 @@ class Protection:
         self._paths = paths
         self._sent_frames = sent_frames
         self._has_one_path, self._is_urgent = settings.paths == 1, settings.urgent
-        fec = settings.options.fec
+        fec = settings.options.is_redundant
         self.late = BestEffortCache(settings.options)
         self.copies = Redundancy(budget=source.copies, is_enabled=self._is_urgent and fec)
         self.parity = ParitySender(keys=keys, budget=source.parity, is_enabled=self._has_one_path and fec)
@@ -88,8 +88,8 @@ class Protection:
     def set_options(self) -> None:
         """Follow the options of the queue, which have changed."""
         options = self._queue.options
-        self.copies.is_enabled = self._is_urgent and options.fec
-        self.parity.is_enabled = self._has_one_path and options.fec
+        self.copies.is_enabled = self._is_urgent and options.is_redundant
+        self.parity.is_enabled = self._has_one_path and options.is_redundant
         self._measure_loss(self._paths.seen_s)
         self.late.set_options(options)
 

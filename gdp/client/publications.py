@@ -14,12 +14,13 @@ from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
 from gdp.client.reader_proxies import TOPICS
 from gdp.client.request_streams import RequestStreams
-from gdp.client.send_options import PublisherSettings
+from gdp.client.send_options import PublisherSettings, SendOptions
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.sequence_numbers import SequenceRegistry
 from gdp.client.timer_queue import TimerQueue
 from gdp.client.unicast_stream import Party, PeerIncarnation
 from gdp.client.unicast_streams import UnicastStreams
+from gdp.congestion.scavenger import ScavengingController
 from gdp.control.join import Join
 from gdp.crypto.control_seal import topic_of
 from gdp.errors import DropReason, LocalError, StatementError
@@ -38,7 +39,8 @@ class Publications:
         requests: to the servers of each name that is called.
         holding: those of them with copies that have not begun.
         timers: of the publishers.
-        reader_paths: to the readers of all of them.
+        reader_paths: to the readers of all of them but those at the priority ``background``.
+        background_paths: to the readers of those.
         scheduler: the order in which they send.
     """
 
@@ -53,7 +55,8 @@ class Publications:
         self._sequence_registry = SequenceRegistry()
         self.timers = TimerQueue[Publisher]()
         self.reader_paths = ReaderPaths()
-        self.scheduler = SendScheduler(self.timers)
+        self.background_paths = ReaderPaths(ScavengingController)
+        self.scheduler = SendScheduler(self.timers, self.background_paths)
         self._drops: Counter[DropReason] = Counter()  # of closed publishers
         self._losses: Counter[LossReason] = Counter()
 
@@ -100,7 +103,7 @@ class Publications:
             description=description,
             settings=settings,
             past=self._sequence_registry.of(name),
-            reader_paths=self.reader_paths,
+            reader_paths=self._paths_for(settings.options),
         )
         publisher.published = self.scheduler.add
         self._publishers[name] = publisher
@@ -108,7 +111,7 @@ class Publications:
 
     def enable_unicast(self, name: Name, secrets: Secrets, settings: PublisherSettings) -> None:
         """Enable unicast streams on a published name from now on."""
-        public, paths_to = self._publishers[name], self.reader_paths
+        public, paths_to = self._publishers[name], self._paths_for(settings.options)
         self.requests[name] = RequestStreams(public, partial(self.stream_to, name), paths_to, self.holding)
         self._private[name] = UnicastStreams(
             service=name,
@@ -117,7 +120,7 @@ class Publications:
             sequence_registry=self._sequence_registry,
             published=self.scheduler.add,
             settings=replace(settings, patience=TOPICS),
-            reader_paths=self.reader_paths,
+            reader_paths=paths_to,
         )
 
     def remove(self, name: Name) -> bool:
@@ -206,15 +209,20 @@ class Publications:
             self.scheduler.add(publisher)
         for streams in self._private.values() if self._private else ():
             streams.forget_idle(now_s)
-        if now_s >= self.reader_paths.due_s and self.reader_paths.handle_timer(now_s):
-            self.scheduler.resume()
+        for paths in (self.reader_paths, self.background_paths):
+            if now_s >= paths.due_s and paths.handle_timer(now_s):
+                self.scheduler.resume()
         if self.holding:
             self.release_requests(now_s)
 
     def attachment_changed(self, now_s: float) -> None:
         """Measure all paths again: frames leave by another switch."""
         self.reader_paths.attachment_changed(now_s)
+        self.background_paths.attachment_changed(now_s)
         self.scheduler.resume()
+
+    def _paths_for(self, options: SendOptions) -> ReaderPaths:
+        return self.background_paths if options.is_background else self.reader_paths
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""

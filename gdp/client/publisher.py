@@ -57,6 +57,8 @@ class Publisher:
     Attributes:
         paths: over how many paths its frames leave, as in its settings.
         is_urgent: its frames go before those of other topics.
+        is_background: its frames leave when no others do.
+        reader_paths: what may leave to each reader node.
         options: as set last.
         matched: its readers.
         queue: messages that wait, and the numbers of all.
@@ -89,10 +91,11 @@ class Publisher:
         self.topic = topic
         self._fastest_governs = settings.patience.fastest_governs
         self.paths, self.options, self.is_urgent = settings.paths, settings.options, settings.urgent
+        self.is_background = settings.options.is_background
         self.has_more = False
         self.published: Callable[[Publisher], None] = lambda _: None
         self._awaits_until_s = NEVER_S
-        self._node_paths = ReaderPaths() if reader_paths is None else reader_paths
+        self.reader_paths = ReaderPaths() if reader_paths is None else reader_paths
         self._keys = KeyEpochs(topic, source, secrets, address)
         self._window = SendWindow(history_depth=settings.depth, first_number=past.next_number, lag_s=lag_s)
         self.queue = SendQueue(keys=self._keys, window=self._window, settings=settings, past=past)
@@ -101,10 +104,10 @@ class Publisher:
         self.matched = ReaderProxies(topic, source, settings.patience)
         self._heartbeats = HeartbeatSchedule(description, past.status_number)
         self.governing_paths = GoverningPaths(
-            paths=self._node_paths, readers=self.matched, queue=self.queue, window=self._window, settings=settings
+            paths=self.reader_paths, readers=self.matched, queue=self.queue, window=self._window, settings=settings
         )
         self.sent_frames = SentFrames(
-            self._node_paths, counts_losses=settings.paths != SPREAD, paces=self.governing_paths.paces.stated
+            self.reader_paths, counts_losses=settings.paths != SPREAD, paces=self.governing_paths.paces.stated
         )
         self.governing_paths.paces.is_under_way = self.sent_frames.is_under_way
         self.acknowledgements = AckNackHandler(
@@ -282,7 +285,7 @@ class Publisher:
         mtu = max(mtu, MTU_MIN_BYTES)
         self.queue.set_mtu(mtu)
         self.matched.is_reachable = True
-        self._node_paths.tree_stands(self.matched.active, mtu)
+        self.reader_paths.tree_stands(self.matched.active, mtu)
         self.protection.late.drop_larger(mtu)
         is_resealed = self.queue.refragment_best_effort(mtu)
         move = self.queue.refragment(mtu)
@@ -356,7 +359,7 @@ class Publisher:
             self.drops[DropReason.SECOND_COPY if is_copy else error.reason] += 1
             return False
         source, hops = header.source, None if header.hops_left & SECOND_PATH else header.hops_left
-        self._node_paths.note_incarnation(source, self.matched.active[source].incarnation_id.started, now_s)
+        self.reader_paths.note_incarnation(source, self.matched.active[source].incarnation_id.started, now_s)
         if self.sent_frames.handle_report(source, report, now_s, waited_s, hops):
             self.drops[DropReason.UNPROVEN] += 1
         self.protection.handle_report(source, report, now_s, is_new=is_new)
@@ -367,7 +370,7 @@ class Publisher:
             self._heartbeats.is_reminder_wanted |= is_moved
         if self._fastest_governs:
             self._window.governing = next(iter(self.governing_paths.fastest()), None)
-        path = self._node_paths.get(source) if report.missing else None  # repairs alone need its round trip
+        path = self.reader_paths.get(source) if report.missing else None  # repairs alone need its round trip
         trip_s = 0.0 if path is None else path.trip_s
         self.acknowledgements.handle_acknack(source, report, is_new=is_new, now_s=now_s, trip_s=trip_s)
         if report.missing:

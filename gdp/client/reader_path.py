@@ -5,12 +5,13 @@ node is shared by all publishers of a participant that this node reads. A frame 
 each. On a topic it leaves when all of them permit it, so the slowest reader governs; of requests the fastest path
 governs. A reader that confirms nothing for a timeout governs no others until a round trip to it is measured again;
 alone, it gets two frames each timeout. When a reader node restarts, its path begins again, and frames to its former
-incarnation do not count.
+incarnation do not count. What leaves at the priority `background` has paths of its own, whose controllers yield to all
+others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import Final
 
 from gdp.congestion.controller import PathController
@@ -49,17 +50,18 @@ class ReaderPath:
         heard_s: monotonic second of the last report.
     """
 
-    def __init__(self, mtu: int, now_s: float) -> None:
+    def __init__(self, mtu: int, now_s: float, new: Callable[[int], PathController] = PathController) -> None:
         self.mtu = mtu
+        self._new = new
         self.sent_bytes = 0
         self.heard_s = -NEVER_S
-        self.controller = PathController(mtu)
+        self.controller = new(mtu)
         self.restart(now_s)
 
     def restart(self, now_s: float) -> None:
         """Begin without knowledge; what is under way will not be confirmed, because its reader node has restarted."""
         self.controller.rate.forget_before()
-        self.controller = PathController(self.mtu)
+        self.controller = self._new(self.mtu)
         self.is_silent = self.is_behind = self.may_probe = self._has_probed = self._awaits_tree = False
         self._late_reports = 0  # in a row
         self._hops: int | None = None
@@ -90,7 +92,8 @@ class ReaderPath:
         if next_s < now_s - BURST_S:
             burst_s = max(controller.pace.credit_s, BURST_S) if controller.pace.is_paced else BURST_S
             next_s = next_s if next_s > now_s - burst_s else now_s - burst_s
-        paced = int((now_s + BURST_S - next_s) * pace) + mtu
+        paced = int((now_s + BURST_S - next_s) * pace) + controller.burst_frames * mtu
+        paced = paced if paced > mtu else mtu
         return free if free < paced else paced
 
     def next_send_s(self) -> float:
@@ -240,13 +243,17 @@ class ReaderPath:
 class ReaderPaths:
     """Paths of one participant, by the name of the reader node.
 
+    Args:
+        new: makes the controller of a path with so many bytes of a full frame.
+
     Attributes:
         due_s: monotonic second of the next ``handle_timer``; infinity: none.
         leaving: flights that are counted, and perhaps not sealed yet.
         changes: count of paths that came and went.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, new: Callable[[int], PathController] = PathController) -> None:
+        self._new = new
         self._paths: dict[bytes, ReaderPath] = {}
         self._started: dict[bytes, int] = {}  # when the newest incarnation of a reader node started
         self.due_s = NEVER_S
@@ -260,11 +267,17 @@ class ReaderPaths:
     def path(self, reader: bytes, now_s: float) -> ReaderPath:
         """Return the path to a reader node; a new one begins without knowledge."""
         if reader not in self._paths:
-            self._paths[reader] = ReaderPath(self._mtu, now_s)
+            self._paths[reader] = ReaderPath(self._mtu, now_s, self._new)
             self.changes += 1
         if self.due_s == NEVER_S:
             self.due_s = now_s + PACE_S
         return self._paths[reader]
+
+    def charge_others(self, size: int, readers: Container[bytes], now_s: float) -> None:
+        """Delay what follows to all but these readers by the time that so many bytes take."""
+        for reader, path in self._paths.items():
+            if reader not in readers:
+                path.controller.pace.charge_other(size, now_s)
 
     def get(self, reader: bytes) -> ReaderPath | None:
         """Return the path to a reader node, or None."""

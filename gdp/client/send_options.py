@@ -13,9 +13,10 @@ from gdp.limits import WINDOW_BYTES
 Priority: TypeAlias = Literal["urgent", "interactive", "high", "normal", "low", "bulk", "background"]
 PRIORITIES: Final[tuple[Priority, ...]] = get_args(Priority)  # first what leaves first
 
-# The first two have the flag URGENT on the wire and go before all others, in order. The others share what is left.
+# The first two have the flag URGENT on the wire and go before all others, in order. The others share what is left, and
+# the last one takes what these leave.
 _STRICT: Final = 2
-_WEIGHTS: Final[dict[Priority, int]] = {"high": 16, "normal": 8, "low": 4, "bulk": 2, "background": 1}
+_WEIGHTS: Final[dict[Priority, int]] = {"high": 16, "normal": 8, "low": 4, "bulk": 2}
 
 WEIGHT_MAX: Final = 100
 HISTORY_MESSAGES_MAX: Final = 100_000
@@ -32,9 +33,10 @@ class SendOptions:
         deadline_s: a best-effort message that cannot leave whole within this time is dropped (ROS 2: lifespan). None: a
             message that waits is dropped when a newer one waits, too.
         weight: share of the path, next to other topics of the same priority.
-        priority: what goes first; ``high`` to ``background`` share the path 16 : 8 : 4 : 2 : 1, times ``weight``.
+        priority: what goes first; ``high`` to ``bulk`` share the path 16 : 8 : 4 : 2, times ``weight``;
+            ``background`` takes what these leave, for as long as a publisher exists.
         max_bits_s: most bits of frames per second; None: what the path carries.
-        fec: messages are sent redundantly against loss that is measured.
+        fec: messages are sent redundantly against loss that is measured; not so at the priority ``background``.
         history_bytes: most bytes that a latched topic keeps for late joiners; None: its depth alone counts.
         history_age_s: longest time that a latched message waits for late joiners; None: its depth alone counts.
         repairs: lost parts of a best-effort message are sent again while that can be in time.
@@ -55,6 +57,16 @@ class SendOptions:
     def rank(self) -> int:
         """Return the place of the priority; 0 leaves first."""
         return PRIORITIES.index(self.priority)
+
+    @property
+    def is_background(self) -> bool:
+        """Return whether messages leave only when no others do, as LEDBAT (RFC 6817) does."""
+        return self.priority == "background"
+
+    @property
+    def is_redundant(self) -> bool:
+        """Return whether messages are sent redundantly; those that may wait are repaired instead."""
+        return self.fec and not self.is_background
 
     @property
     def share(self) -> int:

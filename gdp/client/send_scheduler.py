@@ -2,7 +2,8 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Urgent publishers come first, in the order of their
 priorities. The others share what their paths permit by deficit round robin, by priority and weight. A publisher that
-had nothing to send has its first round before those that wait, so that no image delays a scan. A publisher with several
+had nothing to send has its first round before those that wait, so that no image delays a scan. Those at the priority
+``background`` come last, and their paths count the frames of all. A publisher with several
 readers needs space on all their paths at once. When its turn has come and there is none, publishers behind it leave
 these paths alone for up to ``_RESERVED_S``; else they would take each space as it appears. Sources: Linux
 ``sch_prio``; M. Shreedhar and G. Varghese, Efficient Fair Queuing Using Deficit Round Robin, SIGCOMM 1995; RFC 8290,
@@ -14,6 +15,7 @@ from __future__ import annotations
 from typing import Final
 
 from gdp.client.publisher import Publisher
+from gdp.client.reader_path import ReaderPaths
 from gdp.client.timer_queue import TimerQueue
 from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES
@@ -29,6 +31,7 @@ class SendScheduler:
 
     Args:
         timers: of the publishers; polling frames touches them.
+        background: paths of what leaves when no others do; None: nothing does.
 
     Attributes:
         is_ready: some publisher waits, and the paths hold it back no longer.
@@ -36,8 +39,9 @@ class SendScheduler:
         uncounted: the only publisher, whose frames leave before they are counted; else None.
     """
 
-    def __init__(self, timers: TimerQueue[Publisher]) -> None:
+    def __init__(self, timers: TimerQueue[Publisher], background: ReaderPaths | None = None) -> None:
         self._timers = timers
+        self._background = background
         self._urgent: dict[Publisher, None] = {}
         self._new: dict[Publisher, None] = {}  # had nothing to send before
         self._ordinary: dict[Publisher, int] = {}  # with the bytes left of its round; the one whose turn it is first
@@ -108,6 +112,7 @@ class SendScheduler:
         publisher.governing_paths.share = 1.0
         allowance = publisher.governing_paths.allowance(now_s)
         frames = publisher.poll_frames(now_s, allowance if allowance < self._at_once else self._at_once)
+        self._charge(publisher, frames, now_s)
         self._timers.touched[publisher] = None
         self.uncounted, self._is_idle = publisher, allowance > 0 and not publisher.has_more
         self._new = {}
@@ -146,7 +151,7 @@ class SendScheduler:
         shares = [publisher.options.share for publisher in self._ordinary]
         total, least = sum(shares), min(shares, default=1)
         reserved = frozenset[bytes]()
-        for publisher, left_of_round in list(self._ordinary.items()):
+        for publisher, left_of_round in sorted(self._ordinary.items(), key=lambda each: each[0].is_background):
             publisher.governing_paths.share = publisher.options.share / total
             allowance = publisher.governing_paths.allowance(now_s)
             is_reserved = bool(reserved) and any(name in publisher.matched.active for name in reserved)
@@ -192,10 +197,19 @@ class SendScheduler:
     def _poll(self, publisher: Publisher, limit_bytes: int, now_s: float) -> list[bytes]:
         frames = publisher.poll_frames(now_s, limit_bytes)
         publisher.sent_frames.count()
+        self._charge(publisher, frames, now_s)
         self._timers.touched[publisher] = None
-        if limit_bytes > 0 and not publisher.has_more and len(self._ordinary) + len(self._urgent) + len(self._new) == 1:
-            publisher.governing_paths.note_idle()  # the path could carry more than there is
+        if limit_bytes > 0 and not publisher.has_more:
+            waiting = (*self._ordinary, *self._urgent, *self._new)
+            if sum(not each.is_background for each in waiting) <= 1:
+                publisher.governing_paths.note_idle()  # the path could carry more than there is
         return frames
+
+    def _charge(self, publisher: Publisher, frames: list[bytes], now_s: float) -> None:
+        """Let what is to wait wait for the frames of others; its own count on their paths already."""
+        if frames and self._background and (publisher.is_background or publisher.governing_paths.is_far):
+            readers = publisher.governing_paths.names() if publisher.is_background else ()
+            self._background.charge_others(sum(map(len, frames)), readers, now_s)
 
 
 def _or_never(due_s: float | None) -> float:

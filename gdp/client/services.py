@@ -55,7 +55,8 @@ class ServicePaths:
         """Return the present state of the path to a server."""
         subscription = self._subscriptions.get(self._name)
         writer_proxy = None if subscription is None else subscription.writer_proxies.get(server)
-        path = self._publications.reader_paths.get(server)
+        publisher = self._publications.get(self._name)
+        path = None if publisher is None else publisher.reader_paths.get(server)
         return ServerPath(
             COST_UNREACHABLE if writer_proxy is None else writer_proxy.cost,
             0.0 if path is None else path.trip_s,

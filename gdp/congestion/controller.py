@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from math import sqrt
-from typing import Final
+from typing import ClassVar, Final
 
 from gdp.congestion.cubic import Cubic
 from gdp.congestion.delivery_rate import DeliveryRate, Flight
@@ -83,7 +83,10 @@ class PathController:
         rate: what is under way, and how fast it arrives.
         pace: when the next frame may leave.
         confirmed_sent_s: when the newest flight left that was confirmed.
+        burst_frames: that leave at once, whatever the pace.
     """
+
+    burst_frames: ClassVar[int] = 1
 
     def __init__(self, mtu: int) -> None:
         self.state = State.STARTUP

@@ -1,7 +1,7 @@
 """Model of a path: its round trips, standing queue, delivery rates and loss, as acknowledgements measure them.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Sources: Copa (NSDI 2018) for the standing round trip; BBR
-(draft-ietf-ccwg-bbr) for the rates. A queueing delay up to ``_NOISE_S`` counts as none: programs on both ends are
+(draft-ietf-ccwg-bbr) for the rates. A queueing delay up to ``NOISE_S`` counts as none: programs on both ends are
 scheduled, and read many frames at once.
 """
 
@@ -11,10 +11,10 @@ from collections import deque
 from typing import Final
 
 FIRST_RTT_S: Final = 0.02  # until one is measured
-_NOISE_S: Final = 0.002
+NOISE_S: Final = 0.002
 _STANDING_REPORTS: Final = 4  # that all show a queue, where the empty path is shorter than that noise
 _HOLD_WINDOW_S, _HOLD_MOST_S = 0.2, 0.01  # of reports; a reader reports at least each 20 ms while frames come
-_BASE_WINDOW_S: Final = 10.0  # Copa, section 2
+BASE_WINDOW_S: Final = 10.0  # Copa, section 2
 _RATE_ROUNDS: Final = 10
 _RECENT_ROUNDS: Final = 2
 _CAPACITY_WINDOW_S: Final = 60.0  # longer than a competitor hides what the path can carry
@@ -77,7 +77,7 @@ class PathModel:
         self._highest = WindowedExtreme(is_lowest=False)
         self._hold = WindowedExtreme(is_lowest=False)
         self.base_rtt_s = self.standing_s = FIRST_RTT_S
-        self.empty_path_s = FIRST_RTT_S + _NOISE_S
+        self.empty_path_s = FIRST_RTT_S + NOISE_S
         self.queue_s = self.highest_s = self.hold_s = self.last_bytes_s = 0.0
         self.forget_rates()
 
@@ -93,20 +93,20 @@ class PathModel:
     def add_rtt(self, rtt_s: float, now_s: float) -> None:
         """Add a round trip."""
         self.rtt_s = rtt_s if self.rtt_s is None else self.rtt_s + (rtt_s - self.rtt_s) / 8
-        self.base_rtt_s = self._base.add(now_s, rtt_s, float("-inf") if self.is_hidden else now_s - _BASE_WINDOW_S)
+        self.base_rtt_s = self._base.add(now_s, rtt_s, float("-inf") if self.is_hidden else now_s - BASE_WINDOW_S)
         self.standing_s = self._standing.add(now_s, rtt_s, now_s - self.rtt_s / 2)
         self._trips.append(rtt_s)
-        if self.base_rtt_s < _NOISE_S:
+        if self.base_rtt_s < NOISE_S:
             self.standing_s = min(self.standing_s, *self._trips)
         self.highest_s = self._highest.add(now_s, rtt_s, now_s - 4 * self.rtt_s)
-        self.empty_path_s = self.base_rtt_s + _NOISE_S
+        self.empty_path_s = self.base_rtt_s + NOISE_S
         self.queue_s = max(self.standing_s - self.empty_path_s, 0.0)
 
     def rest_at_standing(self, now_s: float) -> None:
         """Take the standing round trip for that of the empty path, which has changed."""
         self._base.clear()
         self.base_rtt_s = self._base.add(now_s, self.standing_s, now_s)
-        self.empty_path_s = self.base_rtt_s + _NOISE_S
+        self.empty_path_s = self.base_rtt_s + NOISE_S
         self.queue_s = 0.0
 
     def add_hold(self, hold_s: float, now_s: float) -> None:

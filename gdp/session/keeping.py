@@ -1,7 +1,7 @@
 """Keeping of published topics in capsules: what a publisher seals goes to the ring on the disk, and on to a holder.
 
-I/O, by its ring; the loop that drives the member calls ``handle``. Requests to the holder have the lowest priority, so
-live traffic goes first, and one batch is under way for each capsule.
+I/O, by its ring; the loop that drives the member calls ``handle``. Requests to the holder have the priority
+``background``, so they take what live traffic leaves. One batch is under way for each capsule.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from gdp.capsule.chain import CHECKPOINT_NS, ChainWriter
 from gdp.capsule.descriptor import Descriptor
-from gdp.capsule.holder import BATCH_BYTES, YIELDING_BYTES, HolderRequest
+from gdp.capsule.holder import HolderRequest
 from gdp.capsule.record import RecordType
 from gdp.capsule.upload import Uploader
 from gdp.capsule.windows import Mark, Place, Windows
@@ -84,10 +84,8 @@ class _Upload:
             else:
                 uploader.handle_failure(str(call.error), now_s)
 
-    def send_next(
-        self, client: ClientCore, now_s: float, windows: Windows | None, most_bytes: int, *, is_chosen: bool
-    ) -> None:
-        """Send the next request if none is under way, as of ``Uploader``; with ``most_bytes`` 0 begin none."""
+    def send_next(self, client: ClientCore, now_s: float, windows: Windows | None, *, is_chosen: bool) -> None:
+        """Send the next request if none is under way, as of ``Uploader``."""
         reading, uploader, ring = self.reading, self.uploader, self._ring
         if reading is not None and reading.done():
             self.reading = None
@@ -97,15 +95,13 @@ class _Upload:
                 uploader.handle_failure(str(error), now_s)
             else:
                 self._call = _asked(client, uploader.append(offset, data), now_s)
-        if not most_bytes:
-            return
-        wanted = uploader.next_step(ring.begin, ring.end, now_s, windows, most_bytes, is_chosen=is_chosen)
+        wanted = uploader.next_step(ring.begin, ring.end, now_s, windows, is_chosen=is_chosen)
         if isinstance(wanted, HolderRequest):
             self._call = _asked(client, wanted, now_s)
         elif wanted is not None:
             self.reading = ring.read(wanted.offset, wanted.size)
             if self.reading.done():
-                self.send_next(client, now_s, windows, most_bytes, is_chosen=is_chosen)
+                self.send_next(client, now_s, windows, is_chosen=is_chosen)
 
 
 class KeptTopic:
@@ -217,21 +213,15 @@ class KeptTopic:
         if pieces:
             self.ring.append(b"".join(pieces), begins_file=False)
 
-    def upload(self, clients: Mapping[Name, ClientCore], now_s: float, yielding_bytes: int) -> None:
-        """Send the next requests where none is under way.
-
-        Args:
-            yielding_bytes: of records in one, at most, while the ring has space; 0: begin none.
-        """
+    def upload(self, clients: Mapping[Name, ClientCore], now_s: float) -> None:
+        """Send the next requests where none is under way."""
         for each in self._uploads:
             each.handle_call(now_s)
         if not self._chosen.is_busy:
             ready = [each for each in self._uploads if not each.uploader.is_refused] or self._uploads
             self._chosen = max(ready, key=lambda each: (each.uploader.confirmed, each is self._chosen))
-        most_bytes = BATCH_BYTES if self.ring.is_pressed(self.uploader.confirmed) else yielding_bytes
         for each in self._uploads:
-            client = clients[each.holder]
-            each.send_next(client, now_s, self._windows, most_bytes, is_chosen=each is self._chosen)
+            each.send_next(clients[each.holder], now_s, self._windows, is_chosen=each is self._chosen)
 
     @property
     def is_reading(self) -> bool:
@@ -303,7 +293,7 @@ class CapsuleKeeper:
         self._clients: dict[Name, ClientCore] = {}
         self.topics: dict[Name, KeptTopic] = {}
         self.ended: dict[Name, KeptTopic] = {}
-        self._due_s = self._yielding_s = 0.0
+        self._due_s = 0.0
 
     def keep(
         self,
@@ -375,9 +365,8 @@ class CapsuleKeeper:
             due_s = client.get_timer()
             if due_s is not None and now.mono_s >= due_s:
                 client.handle_timer(now.mono_s)
-        yielding_bytes = self._yielding_bytes(now.mono_s)
         for kept in (*self.topics.values(), *self.ended.values()):
-            kept.upload(self._clients, now.mono_s, yielding_bytes)
+            kept.upload(self._clients, now.mono_s)
             if kept.is_reading:
                 self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
         for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
@@ -387,20 +376,6 @@ class CapsuleKeeper:
         """Append what was published so far, for ``is_uploaded``."""
         for kept in self.topics.values():
             kept.flush(int(unix_s * 1e9))
-
-    def _yielding_bytes(self, now_s: float) -> int:
-        """Return how much a request may carry: little if there are live readers, and nothing while they are sent to.
-
-        A stream that never pauses is yielded to for ``PACE_S`` before each request.
-        """
-        live = [each for each in self._member.publications if each.matched.active and each.topic not in self._clients]
-        is_sending = any(each.sent_frames.is_under_way(name) for each in live for name in each.matched.active)
-        if not is_sending:
-            self._yielding_s = now_s
-        if now_s < self._yielding_s + PACE_S and is_sending:
-            return 0
-        self._yielding_s = now_s
-        return YIELDING_BYTES if live else BATCH_BYTES
 
     @property
     def is_uploaded(self) -> bool:

@@ -89,10 +89,6 @@ class CapsuleRing:
         """Return what will be the bytes at an offset."""
         return self._pool.submit(self._segments.read, offset, most)
 
-    def is_pressed(self, confirmed: int) -> bool:
-        """Return whether what no holder has confirmed fills more than a part of the ring."""
-        return self.end - max(self.begin, confirmed) > self._most_bytes // _PARTS
-
     def trim(self, needed: int) -> None:
         """Drop the files whose records all stand below an offset."""
         self._pool.submit(self._trim, needed)

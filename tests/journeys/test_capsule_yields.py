@@ -1,4 +1,4 @@
-"""Uploads yield: what a robot sends live waits little for the history that an outage has left."""
+"""Uploads yield: what a robot sends live does not wait for the history that an outage has left."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from tests.journeys.flows import ROBOT, SERVER, advertise, row
 UPLINK_BYTES_S = 1_250_000
 IMAGE_BYTES = 40_000
 ALONE_S = 0.043  # an image at this rate, as a loop of 5 ms sees it
+FRAME_S = 1_500 / UPLINK_BYTES_S
 
 
-@pytest.mark.parametrize(("backlog", "ring_bytes"), [(False, 1 << 28), (True, 1 << 28), (True, 1 << 24)])
-def test_a_live_image_waits_little_for_an_upload_unless_the_ring_fills(
-    tmp_path: Path, backlog: bool, ring_bytes: int
-) -> None:
+@pytest.mark.parametrize("backlog", [False, True])
+def test_a_live_image_is_as_fresh_as_alone_while_an_upload_takes_what_it_leaves(tmp_path: Path, backlog: bool) -> None:
     world = row()
     world.add_member("nuc2/store", "nuc2")
     assert world.run_until_attached()
-    keeping = Keeping(advertise(world), tmp_path / "robot", ring_bytes)
+    keeping = Keeping(advertise(world), tmp_path / "robot", 1 << 28)
     keeping.step_s = 0.005
     holder = Holder(world, tmp_path / "holder", "nuc2/store")
     camera = advertise(world, "/camera", reliable=False)
@@ -49,13 +48,9 @@ def test_a_live_image_waits_little_for_an_upload_unless_the_ring_fills(
         world.network.call(1.0 + number / 10, partial(shoot, number))
     keeping.run(3.9, holder, until=arrived)
     assert len(ages_s) >= 28
-    left = keeping.kept.ring.end - keeping.kept.uploader.confirmed
-    assert (left > 1_000_000) is backlog
-    assert keeping.kept.uploader.confirmed > (500_000 if backlog else 0)
-    if ring_bytes == 1 << 24:
-        assert left < 1.1 * ring_bytes / 8
-    else:
-        assert not backlog or left > 1.1 * (1 << 24) / 8
-        assert statistics.median(ages_s) < (1.4 if backlog else 1.1) * ALONE_S
+    confirmed = keeping.kept.uploader.confirmed
+    assert (keeping.kept.ring.end - confirmed > 1_000_000) is backlog
+    assert confirmed > (1_500_000 if backlog else 0)
+    assert statistics.median(ages_s) < 1.1 * ALONE_S + FRAME_S
     keeping.run(5, holder)
     assert keeping.run(20, holder, until=keeping.is_uploaded)

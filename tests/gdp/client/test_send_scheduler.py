@@ -73,7 +73,7 @@ class Flood(Publisher):
         self.matched = Everyone()
         self.sent_frames, self.queue = SentFrames(ReaderPaths()), publisher_of().queue
         self.options = SendOptions(weight=weight, priority=priority)
-        self.is_urgent = is_urgent(priority)
+        self.is_urgent, self.is_background = is_urgent(priority), priority == "background"
         self.waiting = waiting
         self.frames_out = 0
         self.has_more = True
@@ -138,15 +138,23 @@ def test_urgent_frames_leave_before_interactive_ones_whichever_came_first() -> N
     assert (urgent.frames_out, interactive.frames_out) == (4, 0)
 
 
-def test_five_priorities_share_a_thin_path_by_their_weights() -> None:
+def test_four_priorities_share_a_thin_path_by_their_weights_and_background_takes_what_they_leave() -> None:
     path = [0]
     floods = {priority: Flood(path, priority=priority) for priority in reversed(PRIORITIES[2:])}
     turns = scheduled(*floods.values())
-    for _ in range(3_100):
+    for _ in range(3_000):
         path[0] = 1_500
         turns.resume()
         turns.poll_turn(0.0)
-    assert [round(floods[each].frames_out / 100) for each in PRIORITIES[2:]] == [16, 8, 4, 2, 1]
+    assert [round(floods[each].frames_out / 100) for each in PRIORITIES[2:]] == [16, 8, 4, 2, 0]
+    assert floods["background"].frames_out <= 2  # of a round that began before the others had frames
+    for each in PRIORITIES[2:-1]:
+        floods[each].waiting = 0
+    for _ in range(100):
+        path[0] = 1_500
+        turns.resume()
+        turns.poll_turn(0.0)
+    assert floods["background"].frames_out >= 90
 
 
 def test_weights_share_what_a_priority_has() -> None:

@@ -10,6 +10,7 @@ import heapq
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from random import Random
 
@@ -18,11 +19,12 @@ from thin_link.channel import Channel, Loss, Rate
 from gdp.client.identities import PublisherIdentity, WriterIdentity
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPath, ReaderPaths
-from gdp.client.send_options import PublisherSettings
+from gdp.client.send_options import Priority, PublisherSettings, SendOptions
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.timer_queue import TimerQueue
 from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.congestion.delivery_rate import Flight
+from gdp.congestion.scavenger import ScavengingController
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import Header, Kind, decode
 from gdp.intervals import NEVER_S
@@ -38,13 +40,23 @@ _READY_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """A topic of the robot, as in the uplink bench."""
+    """A topic of the robot, as in the uplink bench.
+
+    ``waiting``: so many messages always wait; 0: one is published each period. ``on_s``, ``off_s``: seconds for which
+    there are any, and none, in turn, from ``begin_s`` on.
+    """
 
     name: str
     size: int
     period_s: float
     is_reliable: bool = False
     is_urgent: bool = False
+    priority: Priority = "normal"
+    reader: bytes = b"cloud"
+    waiting: int = 0
+    on_s: float = float("inf")
+    off_s: float = 0.0
+    begin_s: float = 0.0
 
 
 TF = Stream("tf", 500, 0.01, is_reliable=True, is_urgent=True)
@@ -67,8 +79,10 @@ class Topic:
     stream: Stream
     publisher: Publisher
     proxy: WriterProxy
+    loss: Loss
     due: int = 0
     arrived: list[tuple[float, float]] = field(default_factory=list)  # second of arrival, age
+    sent_bytes: list[tuple[float, int]] = field(default_factory=list)
 
 
 class SimulatedRobot:
@@ -86,6 +100,7 @@ class SimulatedRobot:
         stall_s: float = 0.0,
         stall_every_s: float = 0.1,
         seed: int = 1,
+        loss: float = 0.0,
     ) -> None:
         self.now_s = 0.0
         self.rtt_s, self.bits_s = rtt_s, bits_s
@@ -94,7 +109,9 @@ class SimulatedRobot:
         self._stall_s, self._stall_every_s, self._frame_s = stall_s, stall_every_s, frame_s
         self._stalled_until_s = {"robot": 0.0, "cloud": 0.0, "near switch": 0.0, "far switch": 0.0}
         self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._paths, self._turns = ReaderPaths(), SendScheduler(TimerQueue())
+        self._loss, self._seed = loss, seed
+        self._paths, self.background_paths = ReaderPaths(), ReaderPaths(ScavengingController)
+        self._turns = SendScheduler(TimerQueue(), self.background_paths)
         self._notes = deque[tuple[float, Topic, bytes]]()
         self._arrivals = deque[tuple[float, Topic, bytes]]()
         self._robot_free_s = self._cloud_free_s = 0.0
@@ -102,7 +119,10 @@ class SimulatedRobot:
         self._cloud_wakes_s = float("inf")
         self.queue_s: list[tuple[float, float]] = []
         self.sent_bytes: list[tuple[float, int]] = []
-        self.reader = reader_of(b"cloud")
+        self._queued = deque[tuple[int, int]]()  # when each background frame has left the link, and its bytes
+        self.ahead_s: list[tuple[float, float]] = []  # of each other frame: what background frames before it take
+        self.readers = {label: reader_of(label) for label in {b"cloud", *(each.reader for each in streams)}}
+        self.reader = self.readers[b"cloud"]
         self.topics = [self._topic(each) for each in streams]
         if stall_s:
             for program in self._stalled_until_s:
@@ -119,8 +139,11 @@ class SimulatedRobot:
     def run(self, until_s: float) -> None:
         """Publish and let time pass."""
         for topic in self.topics:
-            if not topic.due:
+            if not topic.due and topic.stream.begin_s <= self.now_s:
                 self._publish(topic, self.now_s)
+            elif not topic.due:
+                topic.due = 1
+                self.at(topic.stream.begin_s, partial(self._publish, topic, topic.stream.begin_s))
         self._advance(until_s)
 
     def ages(self, name: str, begin_s: float) -> list[float]:
@@ -156,16 +179,19 @@ class SimulatedRobot:
         name, key = Name(stream.name.encode().ljust(32, b".")), SigningKey.generate()
         source: WriterIdentity = source_of(Name(b"robot".ljust(32, b".")), 1, key)
         publisher = Publisher(
-            topic=name, source=source, secrets=_SECRETS, description=b"", reader_paths=self._paths,
-            settings=PublisherSettings(reliable=stream.is_reliable, urgent=stream.is_urgent),
+            topic=name, source=source, secrets=_SECRETS, description=b"",
+            reader_paths=self.background_paths if stream.priority == "background" else self._paths,
+            settings=PublisherSettings(
+                reliable=stream.is_reliable, urgent=stream.is_urgent, options=SendOptions(priority=stream.priority)
+            ),
         )  # fmt: skip
         publisher.tree_stands(MTU)
         publisher.published = self._turns.add
         proxy = WriterProxy(
-            topic=name, reader=self.reader, secrets=_SECRETS, now_s=0.0,
+            topic=name, reader=self.readers[stream.reader], secrets=_SECRETS, now_s=0.0,
             publisher=PublisherIdentity(source.name, 1, key.public, source.control_keys.public),
         )  # fmt: skip
-        return Topic(stream, publisher, proxy)
+        return Topic(stream, publisher, proxy, Loss(self._loss, 1.0, self._seed))
 
     def _settle(self) -> None:
         """Introduce the reader to all publishers, before anything is measured."""
@@ -185,9 +211,16 @@ class SimulatedRobot:
         self.at(again_s, lambda: self._stall(program))
 
     def _publish(self, topic: Topic, due_s: float) -> None:
+        stream, publisher = topic.stream, topic.publisher
+        into_s = (due_s - max(stream.begin_s, _READY_S)) % (stream.on_s + stream.off_s)
+        rest_s = stream.period_s if into_s < stream.on_s else stream.on_s + stream.off_s - into_s
+        next_s = due_s + max(rest_s, 1e-3)
         topic.due += 1
-        topic.publisher.publish(round(due_s * 1e9).to_bytes(8, "big") + bytes(topic.stream.size - 8), self.now_s)
-        self.at(due_s + topic.stream.period_s, lambda: self._publish(topic, due_s + topic.stream.period_s))
+        while into_s < stream.on_s:
+            publisher.publish(round(due_s * 1e9).to_bytes(8, "big") + bytes(stream.size - 8), self.now_s)
+            if publisher.messages - publisher.acknowledgements.acknowledged >= stream.waiting:
+                break
+        self.at(next_s, lambda: self._publish(topic, next_s))
         self._wake_robot(self.now_s)
 
     def _wake_robot(self, moment_s: float) -> None:
@@ -212,7 +245,7 @@ class SimulatedRobot:
             if topic.publisher.get_timer() <= now_s:
                 topic.publisher.handle_timer(now_s)
                 turns.add(topic.publisher)
-        if self._paths.handle_timer(now_s):
+        if self._paths.handle_timer(now_s) | self.background_paths.handle_timer(now_s):
             turns.resume()
         is_waiting = turns.is_ready or turns.due_s < NEVER_S
         frames = [frame for part in turns.poll_turn(now_s) for frame in part] if is_waiting else []
@@ -222,7 +255,8 @@ class SimulatedRobot:
             self.at(self._robot_free_s, lambda: self._transmit(frames))
             self._wake_robot(self._robot_free_s)
             return
-        next_s = min([turns.due_s, self._paths.due_s, *(each.publisher.get_timer() for each in self.topics)])
+        paths_s = min(self._paths.due_s, self.background_paths.due_s)
+        next_s = min([turns.due_s, paths_s, *(each.publisher.get_timer() for each in self.topics)])
         if next_s < NEVER_S:
             self._wake_robot(max(next_s, now_s + 1e-5))
 
@@ -235,18 +269,33 @@ class SimulatedRobot:
         self._turns.resume()
 
     def _transmit(self, frames: list[bytes]) -> None:
+        self._turns.count_sent()
         self._paths.frames_sent(self.now_s)
+        self.background_paths.frames_sent(self.now_s)
         self.at(self._switched_s("near switch"), lambda: self._forward(frames))
 
     def _forward(self, frames: list[bytes]) -> None:
         for frame in frames:
-            due_ns = self._offer(len(frame))
-            if due_ns is not None:
+            topic, due_ns = self._topic_of(frame), self._offer(len(frame))
+            self._note_ahead(topic, len(frame), due_ns)
+            if due_ns is not None and not topic.loss.is_lost():
                 self.at(due_ns / 1e9, lambda frame=frame: self._come(frame))  # type: ignore[misc]
 
+    def _note_ahead(self, topic: Topic, size: int, due_ns: int | None) -> None:
+        """Note how much of the queue that a frame finds is background's."""
+        leaves_ns = round((self.now_s + self.rtt_s / 2) * 1e9)
+        while self._queued and self._queued[0][0] <= leaves_ns:
+            self._queued.popleft()
+        if topic.stream.priority != "background":
+            self.ahead_s.append((self.now_s, sum(size for _, size in self._queued) * 8 / self.bits_s))
+        elif due_ns is not None:
+            self._queued.append((due_ns, size))
+
     def _come(self, frame: bytes) -> None:
+        topic = self._topic_of(frame)
         self.sent_bytes.append((self.now_s, len(frame)))
-        self.at(self._switched_s("far switch"), lambda: self._arrive(self._topic_of(frame), frame))
+        topic.sent_bytes.append((self.now_s, len(frame)))
+        self.at(self._switched_s("far switch"), lambda: self._arrive(topic, frame))
 
     def _switched_s(self, switch: str) -> float:
         """Return when a switch forwards what it received now."""
