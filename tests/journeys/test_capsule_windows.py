@@ -92,7 +92,7 @@ def end(robot: Recorded) -> list[bytes]:
     return [each.message for each in kept]
 
 
-@pytest.mark.parametrize("seed", range(6 * TIMES))
+@pytest.mark.parametrize("seed", range(8 * TIMES - 4))
 def test_exactly_the_union_of_windows_reaches_the_holder(tmp_path: Path, seed: int) -> None:
     rng, robot, number = random.Random(seed), Recorded(tmp_path), 0
     for _ in range(rng.randrange(3, 6)):
