@@ -189,9 +189,7 @@ class NameResolver:
 
     def watch(self, name: Name, now_s: float) -> None:
         """Query a name at once and watch it for attached readers, who proved their right: no bound applies."""
-        query = self._queries.get(name)
-        if query is None:
-            query = self._add(name, now_s, now_s)
+        query = self._queries.get(name) or self._add(name, now_s, now_s)
         if not query.is_watch:
             self._new.discard(query.owner, name)
             query.is_watch = True
@@ -200,8 +198,7 @@ class NameResolver:
 
     def unwatch(self, name: Name) -> None:
         """End the watch of a name for attached readers."""
-        query = self._queries.get(name)
-        if query is None:
+        if (query := self._queries.get(name)) is None:
             return
         if query.is_watch:
             query.is_watch = False
@@ -236,6 +233,11 @@ class NameResolver:
         """
         before = self.cache.put(location)
         is_repeated = before is not None and before.advertisement == location.advertisement
+        query = self._queries.get(location.name)
+        if location.right not in _ACCEPTS_FRAMES and query is not None and not query.is_needed(now_s):
+            # frames that wait for a server that has left ask on: where its clients are does not help them
+            known = self.cache.of(location.name, now_s)
+            has_left |= any(each.switch == self._me and each.right in _ACCEPTS_FRAMES for each in known)
         if not has_left and (not is_ours or is_repeated):
             self._answered(location.name, now_s)
 
@@ -261,8 +263,7 @@ class NameResolver:
         Where none is left, the query is sent again at its next time.
         """
         self.cache.extend(name, now_s)
-        query = self._queries.get(name)
-        if query is None:
+        if (query := self._queries.get(name)) is None:
             return
         query.passed_over.add(rib)
         if not others <= query.passed_over:
@@ -274,8 +275,7 @@ class NameResolver:
 
     def _answered(self, name: Name, now_s: float) -> None:
         """Close the query for a name, or schedule the renewal of its watch."""
-        query = self._queries.get(name)
-        if query is None:
+        if (query := self._queries.get(name)) is None:
             return
         query.passed_over.clear()
         if not query.is_needed(now_s):

@@ -107,6 +107,19 @@ def test_a_server_that_dies_is_no_peer_any_more_and_its_private_stream_ends() ->
     assert list(client.member.subscriptions.writer_proxies()) == []
 
 
+@pytest.mark.momentary("it is about the seconds in which clients still ask a server that died")
+def test_a_server_that_died_is_sought_a_few_times_a_second() -> None:
+    world = row()
+    _, client = pair(world)
+    tap = Tap("nuc5", "nuc5/rib")
+    world.network.taps.append(tap)
+    world.network.stop(SERVER)
+    for number in range(20):
+        world.network.call(0.1 * number, partial(client.publish, b"?"))
+    world.network.run(3.0)
+    assert 0 < tap.count(Kind.RIB_REQUEST) < 100
+
+
 def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
     world = row()
     server, client = pair(world)

@@ -158,6 +158,18 @@ def test_a_node_that_has_left_this_switch_is_queried_again() -> None:
     assert due(resolver, 0.0) == [(SERVER, 0.0)]
 
 
+def test_where_clients_of_a_server_that_has_left_are_does_not_end_the_query_for_it() -> None:
+    resolver = missed()
+    for at_s in (0.1, 0.2):
+        resolver.receive_location(location(right=Right.SERVE, switch=ME), at_s, is_ours=True, has_left=True)
+        resolver.receive_location(replace(location(right=Right.CALL), advertiser=name("client")), at_s)
+        assert resolver.resolve(SERVER, at_s, NEIGHBOUR) is None
+        assert due(resolver, at_s) == []
+    assert due(resolver, RETRY_S) == [(SERVER, 0.0)]
+    resolver.receive_location(replace(location(right=Right.SERVE), advertiser=name("other")), RETRY_S)
+    assert due(resolver, 10 * RETRY_S) == []
+
+
 def test_a_source_is_located_whatever_its_right() -> None:
     resolver = NameResolver(ME)
     assert resolver.resolve_any(TOPIC, 0.0) is None
