@@ -125,12 +125,16 @@ class Uploader:
         if not self._is_chosen:
             self._retry_s = now_s + POLL_S
 
-    def handle_failure(self, reason: str, now_s: float) -> None:
-        """Note that a request failed: the holder is asked for its head again after a while."""
+    def handle_failure(self, reason: str, now_s: float, *, is_silent: bool = False) -> None:
+        """Note that a request failed: the holder is asked for its head again after a while.
+
+        Args:
+            is_silent: no answer came. A path comes back at any time, so the pauses do not grow.
+        """
         self._note(reason)
         self.is_refused = True
         self._most_bytes = max(self._most_bytes // 2, _LEAST_BYTES)
-        self._failures += 1
+        self._failures = 0 if is_silent else self._failures + 1
         self._is_under_way, self._head, self._retry_s = False, None, now_s + _FAILED.pause_s(self._failures)
 
     def poll_faults(self) -> list[str]:

@@ -16,7 +16,6 @@ from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.client.reader_proxies import ReaderProxies
 from gdp.client.send_options import PublisherSettings, SendOptions
 from gdp.client.send_queue import SendQueue
-from gdp.congestion.path_model import NOISE_S
 from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
 from gdp.intervals import NEVER_S
 from gdp.limits import SPREAD
@@ -155,11 +154,6 @@ class GoverningPaths:
         """Note that nothing waits, though the paths may permit more."""
         for path in self._governing():
             path.controller.app_limited()
-
-    @property
-    def is_far(self) -> bool:
-        """Return whether a path is longer than the noise of programs: a shorter one has no uplink in common."""
-        return any(path.controller.model.base_rtt_s >= NOISE_S for path in self._governing())
 
     @property
     def bytes_s(self) -> float | None:

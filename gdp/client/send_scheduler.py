@@ -17,6 +17,7 @@ from typing import Final
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
 from gdp.client.timer_queue import TimerQueue
+from gdp.congestion.path_model import NOISE_S
 from gdp.intervals import NEVER_S
 from gdp.limits import MTU_MIN_BYTES
 
@@ -207,8 +208,12 @@ class SendScheduler:
 
     def _charge(self, publisher: Publisher, frames: list[bytes], now_s: float) -> None:
         """Let what is to wait wait for the frames of others; its own count on their paths already."""
-        if frames and self._background and (publisher.is_background or publisher.governing_paths.is_far):
-            readers = publisher.governing_paths.names() if publisher.is_background else ()
+        if not frames or not self._background:
+            return
+        paths = publisher.governing_paths
+        readers = paths.names() if publisher.is_background else ()
+        base_rtt_s = paths.base_rtt_s  # below the noise of programs it has no uplink in common
+        if publisher.is_background or base_rtt_s is None or base_rtt_s >= NOISE_S:
             self._background.charge_others(sum(map(len, frames)), readers, now_s)
 
 

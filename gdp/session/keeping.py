@@ -32,6 +32,7 @@ from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.service.replication import Mode, Replication
 from gdp.session.protocol.client_core import CALL_TIMEOUT_S, Call, ClientCore
+from gdp.session.protocol.errors import SessionTimeoutError
 from gdp.stores.capsule_ring import CapsuleRing
 
 log = logging.getLogger(__name__)
@@ -82,7 +83,8 @@ class _Upload:
             if call.response is not None:
                 uploader.handle_response(call.response.payload, self._ring.end, now_s)
             else:
-                uploader.handle_failure(str(call.error), now_s)
+                is_silent = isinstance(call.error, SessionTimeoutError)
+                uploader.handle_failure(str(call.error), now_s, is_silent=is_silent)
 
     def send_next(self, client: ClientCore, now_s: float, windows: Windows | None, *, is_chosen: bool) -> None:
         """Send the next request if none is under way, as of ``Uploader``."""

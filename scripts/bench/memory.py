@@ -11,6 +11,7 @@ and down at the same seconds, would have carried the same bytes. Ingest is in pr
 from __future__ import annotations
 
 import random
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,6 +24,8 @@ from typing import Final
 from machine import ROOT
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
+
+sys.path.append(str(ROOT))
 
 from gdp.capsule.audit import Audit
 from gdp.capsule.chain import Chain, ChainWriter

@@ -5,7 +5,7 @@ from __future__ import annotations
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
 from gdp.capsule.upload import Span, Uploader
 from gdp.capsule.windows import Windows
-from gdp.intervals import POLL_S
+from gdp.intervals import POLL_S, RETRY_S
 from tests.gdp.capsule.owned import descriptor
 
 ABOUT = descriptor()
@@ -54,3 +54,15 @@ def test_what_is_left_out_is_stated() -> None:
     assert uploader.next_step(0, END, 0.0, windows) == Span(500, END - 500)
     assert uploader.append(500, b"").gap == 500
     assert uploader.append(600, b"").gap == 600, "the ring dropped more meanwhile"
+
+
+def test_pauses_grow_with_refusals_and_not_with_silences() -> None:
+    for is_silent in (True, False):
+        uploader, now_s, pauses_s = begun(), 0.0, list[float]()
+        for _ in range(4):
+            failed_s = now_s
+            uploader.handle_failure("no", now_s, is_silent=is_silent)
+            while uploader.next_step(0, END, now_s) is None:
+                now_s += 1.0
+            pauses_s.append(now_s - failed_s)
+        assert pauses_s == [RETRY_S] * 4 if is_silent else pauses_s == [RETRY_S * 2**n for n in range(4)]
