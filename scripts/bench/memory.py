@@ -42,6 +42,7 @@ from tests.journeys.flows import ROBOT, SERVER, Flow, advertise, ring
 HOLDER, DESK = "nuc3/store", "nuc3/desk"
 UPLINK_BYTES_S: Final = 1_250_000
 FIFO_S: Final = 0.5
+RING_BYTES: Final = 1 << 32  # more than an hour of pictures
 IMAGE_BYTES, IMAGE_HZ, CMD_HZ = 40_000, 10, 20
 FRAME_BYTES, RTT_S = 1_400, 0.06
 MARKER: Final = b"the robot is in the laboratory"
@@ -55,8 +56,9 @@ def site(folder: Path, *, keeps: bool = True, is_reliable: bool = True) -> tuple
         world.add_member(label, "nuc3")
     assert world.run_until_attached()
     world.leads[ROBOT].bytes_s, world.leads[ROBOT].fifo_s = UPLINK_BYTES_S, FIFO_S
-    flow, holder = advertise(world, "/camera", reliable=is_reliable), Holder(world, folder / "holder", HOLDER)
-    return flow, Keeping(flow, folder / "robot", 1 << 32) if keeps else None, holder
+    flow = advertise(world, "/camera", reliable=is_reliable)
+    holder = Holder(world, folder / "holder", HOLDER, limits=replace(LIMITS, owner_bytes=RING_BYTES))
+    return flow, Keeping(flow, folder / "robot", RING_BYTES) if keeps else None, holder
 
 
 def image(rng: random.Random, number: int) -> bytes:

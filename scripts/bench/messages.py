@@ -46,8 +46,7 @@ SMALL, IMAGE = 100, 921_600
 TIMES: Final = {SMALL: 4, IMAGE: 1}  # of ``count`` messages, by size
 MTUS: Final = (1_500, 9_000)
 OURS: Final = tuple(name for name in BASELINES if name.startswith("gdp"))
-_SIGNED: Final = "gdp-kernel"
-_PAIRS: Final = {_SIGNED: 2}  # ECDSA signatures and checks of a message and its answer
+_PAIRS: Final = {"gdp-kernel": 2}  # ECDSA signatures and checks of a message and its answer
 _SECURED: Final = "zenoh-mtls"
 _UNSECURED: Final = "cyclone"
 _RATIOS: Final = {  # bytes, MTU, whether the cores are half taken: at most
@@ -59,7 +58,6 @@ _RATIOS: Final = {  # bytes, MTU, whether the cores are half taken: at most
     (SMALL, 9_000, True): 0.8,
     (IMAGE, 9_000, True): 0.6,
 }
-_UNSIGNED_RATIO: Final = 0.4
 _ADDED_MS: Final = 1.5
 _SMALL_CPU_MS: Final = 0.12
 
@@ -93,9 +91,9 @@ def targets_of(over: Rounds, ours: Iterable[str], cases: Sequence[Case]) -> list
         if each in _RATIOS:
             what = f"{label} / {_SECURED}, {case}"
             targets.append(over.ratio(what, label, _SECURED, case, MEDIAN, _RATIOS[each], at_most=True))
-        if size == SMALL and not loaded and label == _SIGNED:
+        if size == SMALL and not loaded and label in _PAIRS:
             what = f"{label} less two signatures and checks / {_SECURED}, {case}"
-            targets.append(over.ratio(what, label, _SECURED, case, UNSIGNED, _UNSIGNED_RATIO, at_most=True))
+            targets.append(over.ratio(what, label, _SECURED, case, UNSIGNED, _RATIOS[each], at_most=True))
         if size == SMALL and not loaded:
             targets += [
                 over.target(f"{label}, {case}, {CPU[end]}", label, case, CPU[end], _SMALL_CPU_MS, at_most=True)
