@@ -367,7 +367,7 @@ class Participant:
         """Note that the frames returned last are sent now: sealing them took time."""
         if self._scheduler.uncounted is not None:
             self._scheduler.count_sent()
-        for paths in (self.publications.reader_paths, self.publications.background_paths):
+        for paths in self.publications.all_paths:
             if paths.leaving:
                 paths.frames_sent(now_s)
 

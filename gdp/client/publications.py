@@ -40,7 +40,7 @@ class Publications:
         holding: those of them with copies that have not begun.
         timers: of the publishers.
         reader_paths: to the readers of all of them but those at the priority ``background``.
-        background_paths: to the readers of those.
+        background_paths: to the readers of those; ``all_paths``: both.
         scheduler: the order in which they send.
     """
 
@@ -56,6 +56,7 @@ class Publications:
         self.timers = TimerQueue[Publisher]()
         self.reader_paths = ReaderPaths()
         self.background_paths = ReaderPaths(ScavengingController)
+        self.all_paths = self.reader_paths, self.background_paths
         self.scheduler = SendScheduler(self.timers, self.background_paths)
         self._drops: Counter[DropReason] = Counter()  # of closed publishers
         self._losses: Counter[LossReason] = Counter()
@@ -209,7 +210,7 @@ class Publications:
             self.scheduler.add(publisher)
         for streams in self._private.values() if self._private else ():
             streams.forget_idle(now_s)
-        for paths in (self.reader_paths, self.background_paths):
+        for paths in self.all_paths:
             if now_s >= paths.due_s and paths.handle_timer(now_s):
                 self.scheduler.resume()
         if self.holding:
@@ -217,8 +218,8 @@ class Publications:
 
     def attachment_changed(self, now_s: float) -> None:
         """Measure all paths again: frames leave by another switch."""
-        self.reader_paths.attachment_changed(now_s)
-        self.background_paths.attachment_changed(now_s)
+        for paths in self.all_paths:
+            paths.attachment_changed(now_s)
         self.scheduler.resume()
 
     def _paths_for(self, options: SendOptions) -> ReaderPaths:

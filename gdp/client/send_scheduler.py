@@ -12,6 +12,7 @@ section 4 (new and old queues).
 
 from __future__ import annotations
 
+from itertools import chain, islice
 from typing import Final
 
 from gdp.client.publisher import Publisher
@@ -201,8 +202,8 @@ class SendScheduler:
         self._charge(publisher, frames, now_s)
         self._timers.touched[publisher] = None
         if limit_bytes > 0 and not publisher.has_more:
-            waiting = (*self._ordinary, *self._urgent, *self._new)
-            if sum(not each.is_background for each in waiting) <= 1:
+            live = (each for each in chain(self._ordinary, self._urgent, self._new) if not each.is_background)
+            if len(list(islice(live, 2))) < 2:
                 publisher.governing_paths.note_idle()  # the path could carry more than there is
         return frames
 
