@@ -211,11 +211,10 @@ class SendScheduler:
         """Let what is to wait wait for the frames of others; its own count on their paths already."""
         if not frames or not self._background:
             return
-        paths = publisher.governing_paths
-        readers = paths.names() if publisher.is_background else ()
+        paths, may_wait = publisher.governing_paths, publisher.is_background
         base_rtt_s = paths.base_rtt_s  # below the noise of programs it has no uplink in common
-        if publisher.is_background or base_rtt_s is None or base_rtt_s >= NOISE_S:
-            self._background.charge_others(sum(map(len, frames)), readers, now_s)
+        if may_wait or base_rtt_s is None or base_rtt_s >= NOISE_S:
+            self._background.charge_others(sum(map(len, frames)), paths.names() if may_wait else (), now_s)
 
 
 def _or_never(due_s: float | None) -> float:

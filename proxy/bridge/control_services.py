@@ -118,9 +118,8 @@ class ControlServices:
         bodies = {reader: {**asked, "seen": reply.result.get("generation")} for reader, reply in found.items()}
         self._ask(bodies, now_s, partial(self._respond, event))
 
-    def _respond(self, event: RequestReceived, replies: _Replies, now_s: float) -> None:
+    def _respond(self, event: RequestReceived, replies: _Replies, _now_s: float) -> None:
         """Answer with what every reader says."""
-        del now_s
         act = self._acts.get(event.handle)
         if act is None:
             return  # the topic ended meanwhile

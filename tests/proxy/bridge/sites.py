@@ -15,6 +15,7 @@ from typing import Any, Final, cast
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.crypto.certificates import Role
+from gdp.crypto.statements import parse
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
@@ -287,6 +288,12 @@ class Sites:
                 machine.member.flush(now_s)
                 self.world.network.send_pending(machine.label)
         self.world.network.call(self._look_s, self._look)
+
+
+def revocation_of(world: Simulation, topic: Topic) -> bytes:
+    """Return the owner's revocation of what lets the node of a topic use it."""
+    fingerprint = parse(topic.delegation.chain[-1]).fingerprint
+    return world.owner.revoke(topic.delegation.subject, fingerprint, int(world.network.now.unix_s) + 100_000)
 
 
 def named(name: str, type_name: str = known.STRING, kind: str = "topic") -> Metadata:

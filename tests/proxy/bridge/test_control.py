@@ -11,7 +11,6 @@ from typing import Final, cast
 import pytest
 
 from gdp.control.diagnostics import Question, Reply
-from gdp.crypto.statements import parse
 from gdp.errors import DropReason
 from gdp.message.clock_offset import ClockEstimate
 from gdp.metadata import Metadata
@@ -29,7 +28,7 @@ from proxy.node.control_answer import answer_control
 from proxy.node.proxy_state import ProxyState, proxy_handlers
 from tests.proxy.bridge.clients import Client
 from tests.proxy.bridge.known import channel, channels, services, text_of
-from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Sites, named
+from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Sites, named, revocation_of
 from tests.proxy.endpoints.fake import FakeGraph, Publication
 
 TWIST: Final = "geometry_msgs/msg/Twist"
@@ -265,9 +264,7 @@ def test_a_holder_that_loses_its_grant_is_stopped_and_loses_control(drive: Drive
     drive.drive(SERVER, 1.0)
     world, topic = drive.sites.world, drive.desks[SERVER].bridge.held.find(drive.name, Right.PUBLISH)
     assert topic is not None
-    fingerprint = parse(topic.delegation.chain[-1]).fingerprint
-    wire = world.owner.revoke(topic.delegation.subject, fingerprint, int(world.network.now.unix_s) + 100_000)
-    world.switches["nuc3"].revoke(wire, world.network.now)
+    world.switches["nuc3"].revoke(revocation_of(world, topic), world.network.now)
     world.network.send_pending("nuc3")
     drive.drive(SERVER, 1.0, 2.0)
     assert drive.speeds[-1] == STOP
@@ -370,9 +367,7 @@ def test_a_node_at_the_robot_takes_control_from_everybody(clocked: Drive) -> Non
 def test_who_lost_the_right_to_publish_takes_nothing_by_a_service(clocked: Drive) -> None:
     world, topic = clocked.sites.world, clocked.desks[SERVER].bridge.held.find(clocked.name, Right.PUBLISH)
     assert topic is not None
-    fingerprint = parse(topic.delegation.chain[-1]).fingerprint
-    wire = world.owner.revoke(topic.delegation.subject, fingerprint, int(world.network.now.unix_s) + 100_000)
-    world.switches["nuc3"].revoke(wire, world.network.now)
+    world.switches["nuc3"].revoke(revocation_of(world, topic), world.network.now)
     world.network.send_pending("nuc3")
     clocked.sites.run(2)
     is_taken, _ = clocked.call(SERVER, "take")

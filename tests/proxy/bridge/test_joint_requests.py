@@ -7,11 +7,10 @@ from typing import Final
 
 import pytest
 
-from gdp.crypto.statements import parse
 from gdp.trust.right import Right
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
-from tests.proxy.bridge.sites import ROBOT, SERVER, Machine, Sites
+from tests.proxy.bridge.sites import ROBOT, SERVER, Machine, Sites, revocation_of
 
 RELEASE: Final = f"kind: service, name: /switch, type: {SET_BOOL}"
 DESKS: Final = (SERVER, "nuc3/desk2", "nuc5/desk3")
@@ -126,9 +125,7 @@ def test_a_machine_without_the_right_to_call_is_no_key(keys: Keys) -> None:
     world, held = keys.sites.world, keys.machines[1].bridge.held
     topic = held.find(keys.robot.bridge.flows[0][0].name, Right.CALL)
     assert topic is not None
-    fingerprint = parse(topic.delegation.chain[-1]).fingerprint
-    wire = world.owner.revoke(topic.delegation.subject, fingerprint, int(world.network.now.unix_s) + 100_000)
-    world.switches["nuc3"].revoke(wire, world.network.now)
+    world.switches["nuc3"].revoke(revocation_of(world, topic), world.network.now)
     world.network.send_pending("nuc3")
     keys.sites.run(2)
     keys.turn(0)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from gdp.crypto.certificates import Role
-from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
 from gdp.diagnosis.answer import Cause
 from gdp.diagnosis.facts import Facts, RosProcess, TunnelFact, WaitFact
@@ -24,7 +23,7 @@ from proxy.endpoints.core.qos import default
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switched
-from tests.proxy.bridge.sites import Ear, named
+from tests.proxy.bridge.sites import Ear, named, revocation_of
 from tests.proxy.diagnosis.stage import CHATTER, ROBOT, SERVER, Stage, unreachable, with_waits
 from tests.proxy.endpoints.fake import FakeGraph
 
@@ -163,9 +162,7 @@ def delegation_revoked(folder: Path) -> Stage:
     topic = stage.server.bridge.held.get(next(each.topic for each in stage.server.member.subscriptions).name)
     assert topic is not None
     world = stage.sites.world
-    fingerprint = parse(topic.delegation.chain[-1]).fingerprint
-    wire = world.owner.revoke(topic.delegation.subject, fingerprint, int(world.network.now.unix_s) + 100_000)
-    _revoke(stage, wire)
+    _revoke(stage, revocation_of(world, topic))
     stage.run(70)
     return stage
 
