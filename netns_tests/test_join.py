@@ -82,6 +82,15 @@ def switch_name(directory: Path) -> str:
     return load_card(directory / "switch" / CARD).name.to_text()
 
 
+def created_domain(stack: contextlib.ExitStack, border: Host, address: str, lab: Path) -> str:
+    """Create a domain at a host, in the folder that has the logs; return the line with its token."""
+    words = ("domain", "create", "lab", "--public", address, "--directory", str(lab), "--no-systemd")
+    created = stack.enter_context(running(border, lab.parent, *words))
+    assert created.stdout is not None
+    assert select.select([created.stdout], [], [], PATIENCE_S)[0]
+    return created.stdout.readline()
+
+
 def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
     laboratory: Laboratory, tmp_path: Path
 ) -> None:
@@ -94,11 +103,8 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
         return "".join(each.read_text() for each in tmp_path.glob("*.log"))[-4_000:]
 
     with contextlib.ExitStack() as stack:
-        words = ("domain", "create", "lab", "--public", address, "--directory", str(lab), "--no-systemd")
-        created = stack.enter_context(running(border, tmp_path, *words))
-        assert created.stdout is not None
-        assert select.select([created.stdout], [], [], PATIENCE_S)[0]
-        tokens = [created.stdout.readline(), gdp("domain", "token", "lab", "--directory", str(lab), "--role", "leaf")]
+        first = created_domain(stack, border, address, lab)
+        tokens = [first, gdp("domain", "token", "lab", "--directory", str(lab), "--role", "leaf")]
         until(lambda: "listening on TCP port" in (tmp_path / "border.log").read_text(), said, PATIENCE_S)
         for host, token in zip((robot, arm), tokens, strict=True):
             home = str(tmp_path / host.label)
@@ -134,10 +140,7 @@ def test_a_machine_that_joined_as_a_holder_serves_its_store_once_the_owner_lets_
         return "".join(each.read_text() for each in tmp_path.glob("*.log"))[-4_000:]
 
     with contextlib.ExitStack() as stack:
-        words = ("domain", "create", "lab", "--public", address, "--directory", str(lab), "--no-systemd")
-        created = stack.enter_context(running(border, tmp_path, *words))
-        assert created.stdout is not None
-        assert select.select([created.stdout], [], [], PATIENCE_S)[0]
+        created_domain(stack, border, address, lab)
         token = gdp("domain", "token", "lab", "--directory", str(lab), "--role", "holder")
         until(lambda: "listening on TCP port" in (tmp_path / "border.log").read_text(), said, PATIENCE_S)
         join = ("join", "--label", "archive", "--directory", str(home), "--no-systemd")
