@@ -549,6 +549,8 @@ class Bridge:
                 self._timed_topics.pop(flow, None)
         elif isinstance(flow, ImportedTopic):
             flow.follow(view.ends(Role.SUBSCRIBES, flow_spec))
+            if flow.has_lease:
+                self._timed_topics[flow] = flow_spec.local
         elif isinstance(flow, ExposedService):
             flow.follow(view.ends(Role.SERVES, flow_spec), now_s)
         elif isinstance(flow, ExposedNodes):

@@ -16,8 +16,10 @@ from typing import NamedTuple
 from gdp.capsule.late_join import LateJoin
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Message, Topic
+from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, RemoteError
 from gdp.extras import MissingExtraError
+from gdp.intervals import UPKEEP_S
 from gdp.message.loss import Losses
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
@@ -79,6 +81,7 @@ class ImportedTopic:
         self.unmatched: dict[str, tuple[str, str]] = {}
         self._sources = DecoderCache[tuple[_Decoded, ...]]()
         self.is_joined = False
+        self._look_s = 0.0  # when publishers are looked for next, where local readers have a lease of liveliness
         self._past: LateJoin | None = None
         self.local_readers = 0
         self._past_losses = Losses()  # losses of earlier subscriptions
@@ -168,10 +171,19 @@ class ImportedTopic:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return None if self.control is None else self.control.get_timer()
+        control_s = None if self.control is None else self.control.get_timer()
+        return earliest(control_s, self._look_s if self.has_lease else None)
+
+    @property
+    def has_lease(self) -> bool:
+        """Return whether local readers are to learn that no remote publisher is left."""
+        return self._output.has_lease
 
     def handle_timer(self, now_s: float) -> None:
-        """Publish the message of stop when the holder of control is silent or gone."""
+        """Publish the message of stop when the holder of control is silent or gone; look after a lease."""
+        if self.has_lease and self._look_s <= now_s:
+            self._look_s = now_s + UPKEEP_S
+            self._output.set_alive(bool(self.publishers))
         if self.control is None or not self.control.poll_stop(self.publishers, now_s) or self._stop is None:
             return
         try:

@@ -19,7 +19,7 @@ from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.faults import Fault
 from proxy.endpoints.core.endpoint import GraphEntity, MessageRecorder, Origin
 from proxy.endpoints.core.qos import joint, offer
-from proxy.serial.channel import Channel, Qos
+from proxy.serial.channel import NEVER, Channel, Qos
 from proxy.serial.serializer import Encoding
 from proxy.wire.message import CHANNELS_MAX
 
@@ -63,6 +63,13 @@ class LocalOutput(Protocol):
     def set_offered(self, flow_spec: FlowSpec) -> None:
         """Replace the QoS that the far side states; it holds until a publisher is known."""
 
+    @property
+    def has_lease(self) -> bool:
+        """Return whether local readers are to learn that no remote publisher is left."""
+
+    def set_alive(self, is_alive: bool) -> None:
+        """Let local readers learn whether a remote publisher is left."""
+
     def drop_kept(self) -> None:
         """Drop messages kept for late joiners, when the last local reader has left."""
 
@@ -89,8 +96,13 @@ class MergedPublisher:
 
     @property
     def is_open(self) -> bool:
-        """Return whether the virtual publisher exists."""
-        return self._handle is not None
+        """Return whether its type is known; the virtual publisher exists, or the next message makes it."""
+        return self._channel is not None
+
+    @property
+    def has_lease(self) -> bool:
+        """Return whether a local reader is offered a lease of liveliness."""
+        return self._channel is not None and self._channel.qos[0].lease != NEVER
 
     @property
     def fulfilled(self) -> Qos | None:
@@ -112,8 +124,9 @@ class MergedPublisher:
         return [0] * len(targets)
 
     def publish(self, handle: int, raw: bytes, origin: Origin) -> None:
-        """Publish one message by the virtual publisher, if it exists."""
+        """Publish one message by the virtual publisher, if its type is known."""
         del handle, origin
+        self.set_alive(True)
         if self._handle is not None:
             self._dispatcher.endpoint.publish(self._handle, raw)
             self._kept.append(raw)
@@ -128,6 +141,13 @@ class MergedPublisher:
         """Offer the QoS that the far side states, until a publisher is known."""
         self._flow_spec = flow_spec
         if self._channel is not None and not self._far:
+            self._offer(self._channel)
+
+    def set_alive(self, is_alive: bool) -> None:
+        """Close the virtual publisher while no remote one is left: for DDS, liveliness is lost."""
+        if not is_alive:
+            self.close()
+        elif self._handle is None and self._channel is not None:
             self._offer(self._channel)
 
     def drop_kept(self) -> None:
@@ -171,6 +191,7 @@ class ChannelPublishers:
 
     refusal = Fault.REFUSED
     is_open = True
+    has_lease = False
     fulfilled = None
 
     def __init__(self, dispatcher: EndpointDispatcher, owner: EventHandler, flow_spec: FlowSpec) -> None:
@@ -211,6 +232,9 @@ class ChannelPublishers:
 
     def set_offered(self, flow_spec: FlowSpec) -> None:
         """Ignore it: every channel is recorded as its publisher describes it."""
+
+    def set_alive(self, is_alive: bool) -> None:
+        """Ignore it: a recording has no readers."""
 
     def drop_kept(self) -> None:
         """Drop nothing: a recording keeps everything."""

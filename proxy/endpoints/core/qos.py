@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 from gdp.config.offered_qos import OFFERED_DEPTH_MAX
 from gdp.intervals import NEVER_S
@@ -17,6 +17,7 @@ from proxy.serial.channel import NEVER, Channel, Qos
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one publisher
 INFINITE_FROM_S: Final = 2_147_483_647  # DDS's own infinite value
 _DEPTH: Final = 10  # where none is known; ROS 2's own default
+_TIMES: Final = {"deadline": "a deadline", "lease": "a lease of liveliness"}
 _READER_DEPTH: Final = 1_000  # of the proxy's own subscriptions: a burst waits here, not at its publisher
 
 
@@ -64,7 +65,7 @@ def joint(channel: Channel) -> Qos:
     latched = [each for each in channel.qos if channel.latched and each.durability == "transient_local"]
     if not channel.qos:
         return default(latched=channel.latched)
-    profile = replace(request(channel.qos), deadline=_longest(channel.qos))
+    profile = replace(request(channel.qos), **_longest(channel.qos))
     return replace(profile, durability="transient_local", depth=max(map(depth_of, latched))) if latched else profile
 
 
@@ -100,8 +101,8 @@ def offer(
 ) -> Qos:
     """Return the profile to offer: that of the known remote publishers, and more where a local reader requires it.
 
-    A reader that requests a deadline is offered it, unless one of them has a longer one, or none. The middleware here
-    then tells it that no message came.
+    A reader that requests a deadline, or a lease of liveliness, is offered it, unless one of them has a longer one, or
+    none. The middleware here then tells it that no message came, or that no publisher is left.
 
     Args:
         sources: of the remote publishers, or as the rule states them.
@@ -121,15 +122,18 @@ def offer(
         latched=is_latched or bool(insisting),
         depth=min(max(depth, 1), OFFERED_DEPTH_MAX),
     )
-    deadlines = [each.deadline for each in wants if _seconds(each.deadline)]
-    return (
-        replace(profile, deadline=max(min(deadlines), _longest(sources if is_known else ()))) if deadlines else profile
-    )
+    asked = {name: [time for time in _times(wants, name) if time != NEVER] for name in _TIMES}
+    longest = _longest(sources if is_known else ())
+    return replace(profile, **{name: max(min(times), longest[name]) for name, times in asked.items() if times})
 
 
-def _longest(offers: Sequence[Qos]) -> tuple[int, int]:
-    """Return the longest deadline of publishers; ``NEVER``: one states none; zero: there are no publishers."""
-    return max((each.deadline if _seconds(each.deadline) else NEVER for each in offers), default=(0, 0))
+def _longest(offers: Sequence[Qos]) -> dict[str, Any]:
+    """Return the longest deadline and lease; ``NEVER``: a publisher states none; zero: there are no publishers."""
+    return {name: max(_times(offers, name), default=(0, 0)) for name in _TIMES}
+
+
+def _times(profiles: Sequence[Qos], name: str) -> list[tuple[int, int]]:
+    return [time if _seconds(time := getattr(each, name)) else NEVER for each in profiles]
 
 
 def _seconds(duration: tuple[int, int]) -> float | None:
@@ -143,12 +147,11 @@ def unmatched(want: Qos, offered: Qos | None = None) -> str:
     """Return the policy of a local reader that is not met, empty where there is none.
 
     Args:
-        offered: what the known remote publishers fulfil; None: none is known, and a deadline may yet be met.
+        offered: what the known remote publishers fulfil; None: none is known, and times may yet be met.
     """
-    if offered is not None and (_seconds(want.deadline) or NEVER_S) < (_seconds(offered.deadline) or NEVER_S):
-        return "it requests a deadline, and the far publishers offer none, or a longer one"
+    for name, what in _TIMES.items() if offered is not None else ():
+        if (_seconds(getattr(want, name)) or NEVER_S) < (_seconds(getattr(offered, name)) or NEVER_S):
+            return f"it requests {what}, and the far publishers offer none, or a longer one"
     if want.liveliness not in ("automatic", "system_default", "unknown", "best_available"):
-        return f"it requests liveliness {want.liveliness}, which no network can promise"
-    if want.lease not in (NEVER, (0, 0)):
-        return "it requests a liveliness lease, which no network can promise"
+        return f"it requests liveliness {want.liveliness}, which does not cross: publishers assert it by themselves"
     return ""

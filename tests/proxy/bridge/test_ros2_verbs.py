@@ -8,16 +8,19 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
+import pytest
+
 from tests.proxy.bridge.ros2_sites import Ros2Sites, ros2_sites
+from tests.proxy.endpoints.ros2_interfaces import Interfaces
 from tests.proxy.endpoints.ros2_net import CONFINED, Peer, needs, peer_of
 
 DOMAINS = 200 + os.getpid() % 16, 216 + os.getpid() % 16
 EXPOSE = "kind: node, name: '/*', encoding: cdr"
 GIVE = "name: /cmd"  # of the station, to what the robot subscribes to
-IMPORT = ("kind: node, name: /talker", "kind: node, name: /driver")
+IMPORT = tuple(f"kind: node, name: {name}" for name in ("/talker", "/driver", "/container"))
 GRAPH = {  # what a verb prints, by call
     "node list": "node_list(node)",
-    "node info": "[node_info(node, 'talker'), node_info(node, 'driver')]",
+    "node info": "[node_info(node, each) for each in ('talker', 'driver', 'container')]",
     "topic list, type, find": "topic_list(node)",
     "topic info -v": "[topic_info(node, each) for each in ('/chatter', '/point', '/cmd', '/heard')]",
     "service list, type, find": "service_list(node)",
@@ -27,8 +30,7 @@ GRAPH = {  # what a verb prints, by call
 }
 PAGE = Path(__file__).parents[3] / "docs/reference/ros2cli.md"
 NOT = """
-Not the same: GIDs are those of the other graph. Of QoS events a missed deadline [crosses](qos.md). `component` and tf2
-use services and topics as above; the test does not run them, for their types have no wheels.
+Not the same: GIDs are those of the other graph. Of QoS events [some cross](qos.md).
 """
 VERBS = {
     **GRAPH,
@@ -50,28 +52,35 @@ VERBS = {
     "lifecycle list": "lifecycle_list(node)",
     "lifecycle get": "lifecycle_get(node)",
     "lifecycle set": "lifecycle_set(node)",
+    "component list": "component_list(node)",
+    "component load": "component_load(node)",
+    "component unload": "component_unload(node)",
+    "tf2 monitor": "tf2_monitor(node)",
+    "tf2 echo": "tf2_echo(node)",
 }
 
 
-def peer(stack: ExitStack, name: str, domain: int) -> Peer:
-    """Start a real node in a domain."""
-    environment = {**CONFINED, "ROS_DOMAIN_ID": str(domain)}
-    started: Peer = stack.enter_context(peer_of(name, environment=environment))
-    return started
-
-
-def test_verbs_give_the_same_output_from_afar(tmp_path: Path) -> None:
+def test_verbs_give_the_same_output_from_afar(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     needs("geometry_msgs", "std_srvs", "test_msgs", "lifecycle_msgs")
+    interfaces = Interfaces(tmp_path / "interfaces")
+    interfaces.use(monkeypatch)
     robot, station = DOMAINS
+
+    def peer(name: str, domain: int) -> Peer:
+        environment = {**CONFINED, **interfaces.environment, "ROS_DOMAIN_ID": str(domain)}
+        started: Peer = stack.enter_context(peer_of(name, environment=environment))
+        started.tell("!" + interfaces.load)
+        return started
+
     with ExitStack() as stack:
-        nodes, here = peer(stack, "talker", robot), peer(stack, "_here", robot)
+        nodes, here = peer("talker", robot), peer("_here", robot)
         nodes.tell("!import ros2_robot\nkept.append(ros2_robot.begin(node))")
         here.tell("!from ros2_verbs import *")
         here.waits_for("'/driver' in node_list(node)", wanted=True)
         expected = {verb: here.tell(call) for verb, call in VERBS.items()}
         here.end()
         sites = stack.enter_context(ros2_sites(tmp_path, DOMAINS, [EXPOSE], IMPORT, [GIVE]))
-        afar = peer(stack, "_afar", station)
+        afar = peer("_afar", station)
         afar.tell(
             "!from ros2_verbs import *\nfrom concurrent.futures import ThreadPoolExecutor\npool = ThreadPoolExecutor(1)"
         )

@@ -10,7 +10,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from geometry_msgs.msg import PointStamped
+from composition_interfaces.srv import ListNodes, LoadNode, UnloadNode
+from geometry_msgs.msg import PointStamped, TransformStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces import srv
@@ -27,6 +28,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from test_msgs.action import Fibonacci
+from tf2_msgs.msg import TFMessage
 from type_description_interfaces.srv import GetTypeDescription
 
 _PATIENCE_S = 20.0
@@ -233,6 +235,69 @@ def lifecycle_set(node: Node) -> object:
         request = ChangeState.Request(transition=Transition(id=transition))
         states += [_call(node, ChangeState, "/driver/change_state", request).success, lifecycle_get(node)]
     return states
+
+
+def component_list(node: Node) -> object:
+    """Return the components of each container, which its hidden services name."""
+    kinds = ["composition_interfaces/srv/ListNodes"]
+    names = sorted(name for name, types in node.get_service_names_and_types() if types == kinds)
+    found = {name: _call(node, ListNodes, name) for name in names}
+    return {name: [list(each.full_node_names), list(each.unique_ids)] for name, each in found.items()}
+
+
+def component_load(node: Node) -> object:
+    request = LoadNode.Request(package_name="demo", plugin_name="demo::Component", node_name="part")
+    loaded = _call(node, LoadNode, "/container/_container/load_node", request)
+    request.plugin_name = "demo::Unknown"
+    refused = _call(node, LoadNode, "/container/_container/load_node", request)
+    return [loaded.success, loaded.full_node_name, loaded.unique_id, refused.error_message, component_list(node)]
+
+
+def component_unload(node: Node) -> object:
+    unloaded = [
+        _call(node, UnloadNode, "/container/_container/unload_node", UnloadNode.Request(unique_id=1)) for _ in range(2)
+    ]
+    return [[[each.success, each.error_message] for each in unloaded], component_list(node)]
+
+
+def tf2_monitor(node: Node) -> object:
+    """Return each frame with its parent, and whether the moving ones are new."""
+    frames = _frames(node)
+    now_ns = node.get_clock().now().nanoseconds
+    moving = [stamp for name, stamp in frames.items() if name != "camera"]
+    stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in moving]
+    fresh = all(abs(now_ns - each) < _PATIENCE_S * 1e9 for each in stamps)
+    return {name: each.header.frame_id for name, each in sorted(frames.items())}, fresh
+
+
+def tf2_echo(node: Node) -> object:
+    """Return where the camera is on the map; all frames turn about z."""
+    frames, name = _frames(node), "camera"
+    x, turns = 0.0, 0
+    while name != "map":
+        step = frames[name].transform
+        is_turned = step.rotation.z == 1.0
+        x, turns = step.translation.x + (-x if is_turned else x), turns + is_turned
+        name = frames[name].header.frame_id
+    return [x, turns]
+
+
+def _frames(node: Node) -> dict[str, TransformStamped]:
+    frames: dict[str, TransformStamped] = {}
+
+    def take(message: TFMessage) -> None:
+        frames.update({each.child_frame_id: each for each in message.transforms})
+
+    heard = [
+        node.create_subscription(TFMessage, "/tf", take, 100),
+        node.create_subscription(TFMessage, "/tf_static", take, _LATCHED),
+    ]
+    try:
+        assert _until(lambda: {"odom", "base_link", "camera"} <= frames.keys()), frames
+        return frames
+    finally:
+        for each in heard:
+            node.destroy_subscription(each)
 
 
 def _nodes(node: Node) -> list[tuple[str, str]]:
