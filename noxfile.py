@@ -1,4 +1,4 @@
-"""Sessions of nox: fast, core, full, docs, pages, bench, coverage, and an import test for each supported Python.
+"""Sessions of nox: fast, core, full, docs, pages, bench, coverage, and tests for each Python and for 64-bit ARM.
 
     nox -s fast           static checks and tests without root, under 60 s
     nox -s core           tests without the extensions
@@ -8,8 +8,9 @@
     nox -s pages          the age of measured pages; a nightly run fails where one is old
     nox -s bench          a benchmark, such as -- scripts/bench/messages.py --quick; its options without arguments
     nox -s pythons        imports and quick tests under every supported Python that is installed
+    nox -s arm64          quick tests on emulated 64-bit ARM, in ten minutes, as root
 
-Sessions use .venv, which scripts/setup.sh --dev makes. Only ``pythons`` makes environments of its own.
+Sessions use .venv, which scripts/setup.sh --dev makes. ``pythons`` and ``arm64`` make environments of their own.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ FAST_TESTS = (
     *(f"tests/proxy/{each}" for each in ("config", "wire")),
     *(f"tests/fog/{each}" for each in ("catalog", "host", "latency", "plan")),
 )  # without root, processes and sockets; most tests of the cores
-TEST_TOOLS = ("hypothesis", "jsonschema", "packaging", "pytest")
+ARM64 = tuple(f"--platform={each}_aarch64" for each in ("manylinux_2_28", "manylinux_2_27", "manylinux2014"))
+NEEDS_ROS1 = "tests/proxy/serial/test_service_converter.py"
+TEST_TOOLS = ("hypothesis", "jsonschema", "packaging", "pytest", "pytest-xdist")
 
 nox.options.sessions = ["fast"]
 
@@ -106,6 +109,48 @@ def pythons(session: nox.Session, version: str) -> None:
     session.run(python, "-m", "compileall", "-q", "-f", "gdp", "proxy", "fog", "gdp_extensions", external=True)
     session.run(python, "scripts/import_all.py", "gdp", "proxy", "fog", "gdp_extensions", external=True)
     session.run(python, "-m", "pytest", "-x", *FAST_TESTS, external=True)
+
+
+@nox.session(python=False)
+def arm64(session: nox.Session) -> None:
+    """Run the quick tests, with vectors and serialisation, on emulated ARM; arguments replace the folders."""
+    emulator = shutil.which("qemu-aarch64-static")
+    if emulator is None or shutil.which("mmdebstrap") is None:
+        session.skip("qemu-user-static or mmdebstrap is not installed")
+    root = Path(".nox/arm64").absolute()
+    shutil.rmtree(root, ignore_errors=True)
+    root.parent.mkdir(exist_ok=True)
+    packages = "--include=python3-minimal,libpython3.11-stdlib,libstdc++6,tzdata"
+    words = ("--quiet", "--architectures=arm64", "--variant=extract", packages, "bookworm", str(root))
+    session.run("mmdebstrap", *words, external=True)
+    wheels = ("--target", str(root / "wheels"), *ARM64, "--python-version=3.11", "--only-binary=:all:", "--quiet")
+    for wanted in (("--no-deps", "--require-hashes", "-r", "requirements/run.lock"), (*TEST_TOOLS, "networkx")):
+        session.run(PYTHON, "-m", "pip", "install", *wheels, *wanted, external=True)
+    shutil.copy(emulator, root / "emulator")
+    for folder in ("work", "proc", "dev", "tmp"):
+        (root / folder).mkdir(exist_ok=True)
+    mounts = 'mount --rbind /dev $0/dev && mount -t proc proc $0/proc && mount --bind . $0/work && exec "$@"'
+    names = (
+        "PATH=/usr/sbin:/usr/bin",
+        "HOME=/tmp",
+        "PYTHONPATH=/work:/work/scripts:/wheels",
+        "PYTHONDONTWRITEBYTECODE=1",
+    )
+    test = ("/emulator", "/usr/bin/python3.11", "-m", "pytest", "-o", "addopts=", "-p", "no:cacheprovider", "-q")
+    serial = sorted(map(str, {*Path("tests/proxy/serial").glob("test_*.py")} - {Path(NEEDS_ROS1)}))
+    starts_none = (each for each in FAST_TESTS if each != "tests/fog/host")
+    folders = session.posargs or (*starts_none, "tests/vectors", *serial)
+    inside = (
+        "env",
+        "-i",
+        *names,
+        "chroot",
+        str(root),
+        *test,
+        "--rootdir=/work",
+        *(f"/work/{each}" for each in folders),
+    )
+    session.run("unshare", "--mount", "sh", "-c", mounts, str(root), *inside, external=True)
 
 
 def interpreter(version: str) -> str | None:

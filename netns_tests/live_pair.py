@@ -154,7 +154,13 @@ class Pair:
     """All running processes. Proxies and the ROS 1 master start on first use."""
 
     def __init__(
-        self, run: Run, undo: ExitStack, crossings: Sequence[Crossing], hidden: Mapping[str, str], lease_s: float
+        self,
+        run: Run,
+        undo: ExitStack,
+        crossings: Sequence[Crossing],
+        hidden: Mapping[str, str],
+        lease_s: float,
+        pythons: Mapping[str, Path],
     ) -> None:
         self.folder = run.directory
         lab = Lab(run, _TOPOLOGY)
@@ -164,6 +170,7 @@ class Pair:
             undo.enter_context(each).environment |= {**_ENVIRONMENT, "ROS_LOG_DIR": str(self.folder / "ros")}
         self._crossings = crossings
         self._hidden = hidden
+        self._pythons = pythons
         self._proxies = {label: Proxy(self, label) for label in _GRAPHS}
         self._master: LabProcess | None = None
         self._nodes: dict[str, Peer] = {}
@@ -221,7 +228,7 @@ class Pair:
         if label in self._hidden:
             words.append(f"PYTHONPATH={python_path(self._hide(self._hidden[label]))}")
         machine = self.machines[self._proxies[label].machine]
-        return machine.ready(machine.launch_node("proxy", config.stem, before=words))
+        return machine.ready(machine.launch_node("proxy", config.stem, before=[*words, *self._other_python(label)]))
 
     def identity(self, label: str, role: Role = Role.PROXY) -> Path:
         """Return the directory of a node's keys."""
@@ -253,10 +260,18 @@ class Pair:
             # of its errors most are rospy's retries while a master is away
             node = Peer(name, words, {**_ENVIRONMENT, **logs}, program, subprocess.DEVNULL)
         else:
-            node = Peer(name, words, _ENVIRONMENT)
+            node = Peer(name, [*words, *self._other_python(graph)], _ENVIRONMENT)
         self._undo.callback(node.end)
         node.tell("!from netns_tests.live_nodes import values")
         return node
+
+    def _other_python(self, label: str) -> list[str]:
+        """Return the words that replace this interpreter, the next word, by a graph's own."""
+        python, ours = (
+            self._pythons.get(label),
+            "LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE",
+        )  # set by wheels of ROS
+        return [] if python is None else ["sh", "-c", f'unset {ours}; shift; exec {python} "$@"', "sh"]
 
     def _environment(self, label: str) -> list[str]:
         """Return the command prefix that puts a command into a graph and hides the other graphs from it."""
@@ -265,10 +280,20 @@ class Pair:
 
 
 @contextmanager
-def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None, lease_s: float = LEASE_S) -> Iterator[Pair]:
-    """Two machines with proxies for these rules; ``hidden``: a package that a proxy lacks. All ends on leaving."""
+def pair_of(
+    *crossings: Crossing,
+    hidden: Mapping[str, str] | None = None,
+    lease_s: float = LEASE_S,
+    pythons: Mapping[str, Path] | None = None,
+) -> Iterator[Pair]:
+    """Two machines with proxies for these rules. All ends on leaving.
+
+    Args:
+        hidden: a package that a proxy lacks, by graph.
+        pythons: interpreters with another distribution of ROS 2, by graph.
+    """
     with new_run() as run, ExitStack() as undo:
-        yield Pair(run, undo, crossings, hidden or {}, lease_s)
+        yield Pair(run, undo, crossings, hidden or {}, lease_s, pythons or {})
 
 
 def _metrics(port: int) -> str:
