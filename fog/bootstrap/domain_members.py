@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from fog.bootstrap.members import metadata_of, right_of
+from fog.bootstrap.members import metadata_of
 from fog.cluster import ExportedInterface
 from gdp.crypto.certificates import Role
 from gdp.enrolment.create import make_token
@@ -17,6 +17,7 @@ from gdp.enrolment.registry import MachineRow, Plan, Registry
 from gdp.enrolment.removal import remove_machine
 from gdp.trust.join_token import JoinRole, JoinToken
 from gdp.trust.node_descriptor import NodeDescriptor
+from gdp.trust.right import right_on
 
 
 class DomainMembers:
@@ -55,7 +56,7 @@ class DomainMembers:
         Raises:
             LocalError: another machine has the label, or the domain's files cannot be read.
         """
-        grants = [(metadata_of(each), right_of(each, gives=True)) for each in carried]
+        grants = [(metadata_of(each), right_on(each.kind, gives=True)) for each in carried]
         return make_token(
             self._files,
             JoinRole.GATEWAY if is_gateway else JoinRole.MACHINE,

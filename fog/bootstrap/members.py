@@ -10,17 +10,13 @@ import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from fog.cluster import ExportedInterface
 from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, make_node
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, save_delegation
-from gdp.trust.right import Right
-
-_RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ)}
-_CALLS: Final = (Right.SERVE, Right.CALL)
+from gdp.trust.right import right_on
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +50,7 @@ class Authority:
             LocalError: as ``enrol``, or the node's directory has no node descriptor.
         """
         for each in carried:
-            given = delegate(self.owner, node / CARD, metadata_of(each), [right_of(each, gives=False)], days=days)
+            given = delegate(self.owner, node / CARD, metadata_of(each), [right_on(each.kind, gives=False)], days=days)
             save_delegation(delegations, given, force=True)
 
     @property
@@ -68,9 +64,3 @@ def metadata_of(carried: ExportedInterface) -> Metadata:
     own = {"kind": carried.kind, "name": carried.name, "type": carried.type_name}
     more = carried.options.get("metadata", {})
     return Metadata({**own, **more} if isinstance(more, dict) else own)
-
-
-def right_of(carried: ExportedInterface, *, gives: bool) -> Right:
-    """Return the right needed to provide an interface, or to use it."""
-    give, take = _RIGHTS.get(carried.kind, _CALLS)
-    return give if gives else take

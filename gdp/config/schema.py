@@ -8,10 +8,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Final, TypeVar, get_args
 
 import orjson
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo
+from pydantic.config import JsonDict
 from pydantic_core import ErrorDetails
 
 from gdp.config.machine_file import section_source
@@ -50,6 +51,17 @@ class Section(BaseModel):
     renamed: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True)
+
+
+def or_short(*short: JsonDict) -> Any:
+    """Return the field of a section that is also stated in short forms, of these schemas; a validator reads them."""
+
+    def add(schema: JsonDict) -> None:
+        forms = schema.get("anyOf")
+        if isinstance(forms, list):
+            schema["anyOf"] = [*short, *forms]
+
+    return Field(json_schema_extra=add)
 
 
 def relative(path: Path, info: ValidationInfo) -> Path:

@@ -28,6 +28,13 @@ HEARS: Final = MappingProxyType({Right.READ: Right.PUBLISH, Right.SERVE: Right.C
 """Who hears whom on one name: a node that claims the first gets what those that claim the second send to it."""
 
 
+def right_on(kind: object, *, gives: bool) -> Right:
+    """Return the right to give a name of a kind of ROS to others (``gives``), or to use it."""
+    if kind == "topic":
+        return Right.PUBLISH if gives else Right.READ
+    return Right.SERVE if gives else Right.CALL
+
+
 def _sorted(rights: Collection[Right]) -> tuple[Right, ...]:
     """Return rights as they are sent. Raises ``LocalError``: none, or one that cannot be delegated."""
     if not rights or not DELEGABLE.issuperset(rights):

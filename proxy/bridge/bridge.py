@@ -368,7 +368,7 @@ class Bridge:
         if self._context.keeper is not None:
             self._context.keeper.renew(held)
         for key, (flow_spec, flow) in list(self._flows.items()):
-            topic = held.find(flow_spec.name, _right(flow_spec))
+            topic = held.find(flow_spec.name, flow_spec.right)
             if topic is None:
                 self._end(key)
             else:
@@ -623,7 +623,7 @@ class Bridge:
 
     def _may_use(self, key: _Key, flow_spec: FlowSpec) -> Topic | None:
         """Return the delegation of a flow; a missing one is recorded."""
-        topic = self.held.find(flow_spec.name, _right(flow_spec))
+        topic = self.held.find(flow_spec.name, flow_spec.right)
         if topic is None:
             self._undelegated[key] = flow_spec
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
@@ -655,7 +655,7 @@ class Bridge:
         """Return whether the rule and the delegation of a flow still apply: it ends because its local node has gone."""
         flow_spec, _ = self._flows[key]
         rules = (*self.rules.expose, *self.rules.imports)
-        return stated(flow_spec.rule) in rules and self.held.find(flow_spec.name, _right(flow_spec)) is not None
+        return stated(flow_spec.rule) in rules and self.held.find(flow_spec.name, flow_spec.right) is not None
 
     def _finish(self, key: _Key) -> None:
         """End a flow; the last messages of an exposed one stay until readers have confirmed them."""
@@ -716,7 +716,7 @@ class Bridge:
 
     def _how_to_delegate(self, flow_spec: FlowSpec) -> str:
         return (
-            f"no delegation to {_right(flow_spec).value} [{flow_spec.type_name}] as {flow_spec.name.to_text()} in"
+            f"no delegation to {flow_spec.right.value} [{flow_spec.type_name}] as {flow_spec.name.to_text()} in"
             f" {self.held.directory}; the owner makes all that this proxy needs with"
             " 'gdp delegate --owner OWNER --live FILE' (FILE: its proxy.yaml)"
         )
@@ -737,9 +737,3 @@ def _shown_as(flow_spec: FlowSpec) -> str:
     if flow_spec.rule.kind == "node":
         return presence_of_nodes(flow_spec.name)
     return presence_of(flow_spec.local) if flow_spec.is_exposed and flow_spec.rule.kind != "topic" else flow_spec.local
-
-
-def _right(flow_spec: FlowSpec) -> Right:
-    if flow_spec.rule.kind == "topic":
-        return Right.PUBLISH if flow_spec.is_exposed else Right.READ
-    return Right.SERVE if flow_spec.is_exposed else Right.CALL

@@ -16,17 +16,18 @@ from gdp.diagnosis.facts import FlowFact, ProxyFacts, WaitFact
 from gdp.errors import RemoteError
 from gdp.message.loss import by_label
 from gdp.names import Name
-from gdp.ros_names import ACTION_INFIX, Kind
+from gdp.ros_names import ACTION_INFIX
 from gdp.sansio import Timestamps
-from gdp.trust.right import Right
+from gdp.trust.right import Right, right_on
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.desired_flows import ROLES
 from proxy.bridge.core.node_rules import node_entity
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.config.rule import Rule
-from proxy.endpoints.core.endpoint import GraphEntity, Role
+from proxy.endpoints.core.endpoint import GraphEntity
 
 _FLOWS_MAX: Final = 16
 _KNOWN_MAX: Final = 64
@@ -34,22 +35,6 @@ _SHORT_CHARS: Final = 16  # of a digest
 _DETAIL_CHARS: Final = 200
 _NAME_DIGITS: Final = 64
 
-_ROLES: Final[dict[tuple[Kind, bool], Role]] = {
-    ("topic", True): Role.PUBLISHES,
-    ("topic", False): Role.SUBSCRIBES,
-    ("service", True): Role.SERVES,
-    ("service", False): Role.CALLS,
-    ("action", True): Role.SERVES,
-    ("action", False): Role.CALLS,
-    ("node", True): Role.SERVES,
-    ("node", False): Role.CALLS,
-}
-_RIGHTS: Final[dict[tuple[bool, bool], Right]] = {  # is it a topic, is it exposed
-    (True, True): Right.PUBLISH,
-    (True, False): Right.READ,
-    (False, True): Right.SERVE,
-    (False, False): Right.CALL,
-}
 _RANKED_MAX: Final = 8
 _PART: Final = {"topic": "", "service": "", "action": f"{ACTION_INFIX}send_goal", "node": ""}
 
@@ -153,7 +138,7 @@ def _types(bridge: Bridge, rule: Rule, local: str, graph: Sequence[GraphEntity],
     carried = {spec.type_name for spec, _ in bridge.flows if (spec.rule, spec.local) == (rule, local)}
     if carried:
         return carried
-    role = _ROLES[rule.kind, is_exposed]
+    role = ROLES[is_exposed][rule.kind]
     return {end.type_name for end in graph if (end.name, end.role) == (local, role) and end.type_name}
 
 
@@ -166,8 +151,7 @@ def _flow_fact(
     now: Timestamps,
 ) -> FlowFact:
     rule, local, name = meant.rule, meant.local, meant.name
-    right = _RIGHTS[rule.kind == "topic", meant.is_exposed]
-    role = _ROLES[rule.kind, meant.is_exposed]
+    right, role = right_on(rule.kind, gives=meant.is_exposed), ROLES[meant.is_exposed][rule.kind]
     meant_nodes = (end for end in graph if rule.kind == "node" and rule.matches(end.node))
     ends_here = {replace(node_entity(end), name=local) for end in meant_nodes} if rule.kind == "node" else graph
     under = [end for end in ends_here if (end.name, end.role) == (local + _PART[rule.kind], role) and not end.is_proxy]

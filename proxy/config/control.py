@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import Annotated, Final, Literal
 
 from pydantic import BeforeValidator, Field, JsonValue, WithJsonSchema
-from pydantic.config import JsonDict
 
-from gdp.config.schema import Section
+from gdp.config.schema import Section, or_short
 from gdp.intervals import MINUTE_S, PROMPT_S
 
 EXCLUSIVE: Final = "exclusive"
@@ -35,10 +34,4 @@ def _control(value: object) -> object:
     return {"mode": value} if isinstance(value, str) else value
 
 
-def _or_mode(schema: JsonDict) -> None:
-    forms = schema.get("anyOf")
-    if isinstance(forms, list):
-        schema["anyOf"] = [{"const": EXCLUSIVE}, *forms]
-
-
-SomeControl = Annotated[Control | None, BeforeValidator(_control), Field(json_schema_extra=_or_mode)]
+SomeControl = Annotated[Control | None, BeforeValidator(_control), or_short({"const": EXCLUSIVE})]

@@ -5,13 +5,13 @@ Section of a configuration file.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import BeforeValidator, Field
 from pydantic.config import JsonDict
 
 from gdp.client.send_options import HISTORY_BYTES_MAX, HISTORY_MESSAGES_MAX
-from gdp.config.schema import Section
+from gdp.config.schema import Section, or_short
 from gdp.intervals import DAY_S
 
 
@@ -32,11 +32,7 @@ def _history(value: object) -> object:
     return {"messages": value} if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-def _or_count(schema: JsonDict) -> None:
-    forms = schema.get("anyOf")
-    if isinstance(forms, list):
-        count: JsonDict = {"type": "integer", "minimum": 1, "maximum": HISTORY_MESSAGES_MAX}
-        schema["anyOf"] = [count, {"const": "from-store"}, *forms]
+_COUNT: Final[JsonDict] = {"type": "integer", "minimum": 1, "maximum": HISTORY_MESSAGES_MAX}
 
 
-SomeHistory = Annotated[History | None, BeforeValidator(_history), Field(json_schema_extra=_or_count)]
+SomeHistory = Annotated[History | None, BeforeValidator(_history), or_short(_COUNT, {"const": "from-store"})]

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, model_validator
-from pydantic.config import JsonDict
 
-from gdp.config.schema import Section, relative
+from gdp.config.schema import Section, or_short, relative
 from gdp.errors import LocalError
 from gdp.extras import Seam
 
@@ -106,19 +105,5 @@ def _adapt(value: object) -> object:
     return value
 
 
-def _or_codec(schema: JsonDict) -> None:
-    _add(schema, {"const": "zstd"})
-
-
-def _or_flag(schema: JsonDict) -> None:
-    _add(schema, {"type": "boolean"})
-
-
-def _add(schema: JsonDict, short: JsonDict) -> None:
-    forms = schema.get("anyOf")
-    if isinstance(forms, list):
-        schema["anyOf"] = [short, *forms]
-
-
-SomeCompress = Annotated[Compress | None, BeforeValidator(_compress), Field(json_schema_extra=_or_codec)]
-SomeAdapt = Annotated[Adapt | None, BeforeValidator(_adapt), Field(json_schema_extra=_or_flag)]
+SomeCompress = Annotated[Compress | None, BeforeValidator(_compress), or_short({"const": "zstd"})]
+SomeAdapt = Annotated[Adapt | None, BeforeValidator(_adapt), or_short({"type": "boolean"})]

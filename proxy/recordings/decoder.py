@@ -32,8 +32,8 @@ from gdp.errors import ConfigError, LocalError
 from proxy.recordings import mcap_format, salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.recordings.channels import from_connection
 from proxy.recordings.plain_yaml import BoundedYaml, load_plain
-from proxy.recordings.source import COMPRESSIONS, ZSTD, JoinedSource, Message, Source, UnpackedSource
-from proxy.recordings.unpacking import bound_rosbags, unpack_file
+from proxy.recordings.source import COMPRESSIONS, ZSTD, JoinedSource, Message, Source
+from proxy.recordings.unpacking import SalvageError, bound_rosbags, unpack, unpack_file
 from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError, UnparsedError, parse
 
@@ -82,12 +82,16 @@ class BagDecoder(ClosedOnExit):
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         try:
-            self._source = _open(self.path)
+            with contextlib.ExitStack() as stack:
+                self._source = _open(self.path, stack)
+                stack.callback(self._source.close)
+                self._stack = stack.pop_all()
         except _FOREIGN as error:
             raise ConfigError(str(self.path), "", f"cannot be read: {_reason(error)}") from error
         checked = [_checked(channel) for channel in self._source.channels]
         self.channels = [channel for channel, _ in checked]
         self._opaque = [reason for _, reason in checked if reason]
+        self._packed = ""  # why a message that is compressed by itself was left out
 
     @property
     def count(self) -> int:
@@ -105,7 +109,7 @@ class BagDecoder(ClosedOnExit):
 
         The text is final after ``messages``.
         """
-        return "; ".join(filter(None, (self._source.unread, *self._opaque)))
+        return "; ".join(filter(None, (self._source.unread, self._packed, *self._opaque)))
 
     def messages(self) -> Iterator[Message]:
         """Yield (channel index, stamp in ns, bytes) in time order; a file that ends early is no error.
@@ -114,13 +118,27 @@ class BagDecoder(ClosedOnExit):
             ConfigError: there is not enough memory; ``MemoryError`` is its cause.
         """
         try:
-            yield from self._source.messages()
+            yield from filter(None, map(self._unpacked, self._source.messages()))
         except MemoryError as error:
             raise ConfigError(str(self.path), "", f"cannot be read: {_reason(error)}") from error
 
+    def _unpacked(self, message: Message) -> Message | None:
+        """Return a message of ROS 2 that is compressed by itself as it was (CDR begins with a zero byte); None: not."""
+        channel, raw = self.channels[message.channel], message.raw
+        if channel.ros == 1:
+            return message
+        other = next((name for magic, name in COMPRESSIONS.items() if raw.startswith(magic)), "")
+        if not (other or raw.startswith(ZSTD)):
+            return message
+        try:
+            return message._replace(raw=unpack(other or "zstd", raw, is_whole=True))
+        except SalvageError as error:
+            self._packed = self._packed or f"a message of {channel.topic} cannot be unpacked: {error}"
+            return None
+
     def close(self) -> None:
         """Close the files."""
-        self._source.close()
+        self._stack.close()
 
 
 def _checked(channel: Channel) -> tuple[Channel, str]:
@@ -140,9 +158,10 @@ def _reason(error: BaseException) -> str:
     return " ".join(text.split())[:300] or type(error).__name__
 
 
-def _open(path: Path) -> Source:
+def _open(path: Path, stack: contextlib.ExitStack) -> Source:
+    """Open a recording; ``stack`` removes what is unpacked for it."""
     if path.is_dir():
-        return _open_folder(path)
+        return _open_folder(path, stack)
     with path.open("rb") as file:
         magic = file.read(16)
     if not magic:
@@ -150,18 +169,20 @@ def _open(path: Path) -> Source:
     if magic.startswith(b"#ROSBAG"):
         return _open_ros1(path)
     if magic.startswith(mcap_format.MAGIC):
-        return UnpackedSource(_open_mcap(path))
+        return _open_mcap(path)
     if magic.startswith(salvage_sqlite.MAGIC):
-        return UnpackedSource(salvage_sqlite.SqliteSource(path))
+        return salvage_sqlite.SqliteSource(path)
     if magic.startswith(ZSTD):
-        return _UnpackedFile(path)
+        unpacked = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="unpacked-"))) / path.stem
+        unpack_file(path, unpacked)
+        return _open(unpacked, stack)
     for start, name in COMPRESSIONS.items():
         if magic.startswith(start):
             raise LocalError(f"it is compressed by {name}: unpack it first")
     raise LocalError("neither a ROS 1 bag nor MCAP nor sqlite3")
 
 
-def _open_folder(path: Path) -> Source:
+def _open_folder(path: Path, stack: contextlib.ExitStack) -> Source:
     """Open the storage files of a folder, whatever its metadata.yaml says: that is written last, and is edited."""
     storage = sorted(file for pattern in _STORAGE for file in path.glob(pattern) if file.stat().st_size)
     if not storage:
@@ -170,7 +191,7 @@ def _open_folder(path: Path) -> Source:
     lacking = _lacking(path / "metadata.yaml", {file.name for file in storage})
     for file in storage:
         try:
-            parts.append(_open(file))
+            parts.append(_open(file, stack))
         except _FOREIGN as error:
             lacking.append(f"{file.name} cannot be read: {_reason(error)}")
     if not parts:
@@ -196,22 +217,6 @@ def _lacking(metadata: Path, there: set[str]) -> list[str]:
 
 def _absent(metadata: Path, name: str) -> str:
     return f"{name}, which {metadata.name} names, is {'empty' if (metadata.parent / name).exists() else 'not there'}"
-
-
-class _UnpackedFile(UnpackedSource):
-    """A storage file that is compressed as a whole, unpacked into a folder of its own."""
-
-    def __init__(self, path: Path) -> None:
-        with contextlib.ExitStack() as stack:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="unpacked-"))
-            unpacked = Path(folder) / path.stem
-            unpack_file(path, unpacked)
-            super().__init__(_open(unpacked))
-            self._folder = stack.pop_all()
-
-    def close(self) -> None:
-        super().close()
-        self._folder.close()
 
 
 def _open_mcap(path: Path) -> Source:

@@ -1,6 +1,6 @@
 """Source of a recording's messages: the interface of all decoders, and its general forms.
 
-Forms: positions found without an index, messages compressed one by one, and several storage files.
+Forms: positions found without an index, and several storage files.
 I/O; files are opened for reading only.
 """
 
@@ -209,50 +209,6 @@ class Scan(ABC):
         lacking = [self.stats.text(reason or self.unclosed)] if reason or self.unclosed else []
         source.unread = "; ".join([*lacking, *self.left_out])
         return source
-
-
-class UnpackedSource:
-    """Messages of a ROS 2 recording, those that are compressed one by one unpacked as they are read.
-
-    CDR begins with a zero byte. What is compressed and cannot be unpacked is omitted and reported.
-    """
-
-    def __init__(self, packed: Source) -> None:
-        self.channels = packed.channels
-        self._packed = packed
-        self._refused = ""
-
-    @property
-    def count(self) -> int:
-        """Return the number of messages, compressed or not."""
-        return self._packed.count
-
-    @property
-    def counts(self) -> list[int] | None:
-        """Return the messages of each channel, as far as known."""
-        return self._packed.counts
-
-    @property
-    def unread(self) -> str:
-        """Return why some could not be read or unpacked."""
-        return "; ".join(text for text in (self._packed.unread, self._refused) if text)
-
-    def messages(self) -> Iterator[Message]:
-        """Yield messages in time order."""
-        for message in self._packed.messages():
-            channel, raw = self.channels[message.channel], message.raw
-            other = next((name for magic, name in COMPRESSIONS.items() if raw.startswith(magic)), "")
-            if channel.ros == 1 or not (other or raw.startswith(ZSTD)):
-                yield message
-                continue
-            try:
-                yield message._replace(raw=unpack(other or "zstd", raw, is_whole=True))
-            except SalvageError as error:
-                self._refused = self._refused or f"a message of {channel.topic} cannot be unpacked: {error}"
-
-    def close(self) -> None:
-        """Close the files."""
-        self._packed.close()
 
 
 class JoinedSource:

@@ -18,17 +18,15 @@ round ``image`` and ``small`` run for a minute.
 
     sudo .venv/bin/python scripts/bench/ros.py                     # topics; writes docs/benchmarks/ros.*
     sudo .venv/bin/python scripts/bench/ros.py --calls             # a service; writes docs/benchmarks/services.*
-    sudo .venv/bin/python scripts/bench/ros.py --trace --no-save   # where the time of an image goes, step by step
     sudo .venv/bin/python scripts/bench/ros.py --quick --no-save   # a few seconds each: does it work?
     sudo .venv/bin/python scripts/bench/ros.py --rounds 1 --seconds 60 --mtu 1500 --no-save
 """
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -37,12 +35,11 @@ from typing import Final
 from plot import panels_of
 from report import Rounds, Target
 from ros_row import READY_S, Row
-from ros_trace import read_calls, steps_of
 from skeleton import Options, Outcome, Recorder, Trial, command_line, parse, perform
 
 from lab.credentials import Carried
 from lab.dds import BUFFER_BYTES
-from lab.process import FailedError, LabProcess, new_run
+from lab.process import FailedError, new_run
 from lab.topology import LEFT, RIGHT
 
 DIRECT, OVERLAY, SESSION = "direct", "overlay, cdr", "overlay, cdr, session"
@@ -99,20 +96,6 @@ def kinds_of(options: Options, mtu: int) -> tuple[str, ...]:
     return tuple(STREAMS) if mtu == options.mtu[0] else ("image",)
 
 
-@contextmanager
-def talking(
-    row: Row, program: Sequence[str], settings: Mapping[str, object], *, direct: bool
-) -> Iterator[tuple[LabProcess, LabProcess]]:
-    """Start a listener at B and a talker at A; yield both when every topic is received."""
-    words = [json.dumps(settings)]
-    with (
-        row.process(RIGHT, "listen", [*program, "listen", *words], direct=direct) as listener,
-        row.process(LEFT, "talk", [*program, "talk", *words], direct=direct) as talker,
-    ):
-        listener.read(READY_S)
-        yield listener, talker
-
-
 def measure_stream(row: Row, kind: str, who: str, options: Options, number: int) -> dict[str, float]:
     """Return the figures of one stream in a round, by column. Raises ``FailedError``: nothing was received."""
     stream, is_direct = STREAMS[kind], who == DIRECT
@@ -120,7 +103,11 @@ def measure_stream(row: Row, kind: str, who: str, options: Options, number: int)
     seconds = max(options.seconds, LONG_S) if is_long else options.seconds
     count = round(seconds / stream.every_s)
     settings = {"kind": kind, "topics": stream.topics, "count": count, "every_s": stream.every_s}
-    with talking(row, ("-m", "ros_topics"), settings, direct=is_direct) as (listener, talker):
+    with (
+        row.node(RIGHT, "ros_topics", "listen", direct=is_direct, **settings) as listener,
+        row.node(LEFT, "ros_topics", "talk", direct=is_direct, **settings) as talker,
+    ):
+        listener.read(READY_S)  # every topic is received
         cpu_s = row.proxies_cpu_s()
         talker.send(signal.SIGUSR1)
         said = listener.read(seconds + _DONE_S)
@@ -141,29 +128,6 @@ def measure_calls(row: Row, case: str, who: str, options: Options, _: int) -> di
             said = client.read(seconds + _DONE_S)
             used = (row.proxies_cpu_s() - cpu_s) / seconds
     return _figures(said, used) | {"calls": said["sent"], UNANSWERED: said["lost"], WRONG: said["wrong"]}
-
-
-def measure_trace(options: Options) -> Outcome:
-    """Measure the steps of images on their way over both proxies, and directly."""
-    stream, over = STREAMS["image"], Rounds()
-    count = round(options.seconds / stream.every_s)
-    settings = {"kind": "image", "topics": stream.topics, "count": count, "every_s": stream.every_s}
-    for mtu in options.mtu:
-        with new_run() as run:
-            stem, pids = run.directory / "calls", {}
-            program = ("-m", "ros_trace", str(stem))
-            with Row(run, CARRIED, mtu=mtu, program=(*program, "proxy")) as row:
-                for who in (DIRECT, OVERLAY):
-                    with talking(row, program, settings, direct=who == DIRECT) as (listener, talker):
-                        talker.send(signal.SIGUSR1)
-                        for node in (listener, listener, talker):  # what it received; its calls are written
-                            node.read(options.seconds + _DONE_S)
-                        pids[who] = [listener.pid, talker.pid]
-                pids[OVERLAY] += row.proxies
-            for who, each in pids.items():
-                for step, took_ms in steps_of(read_calls(stem, each)).items():
-                    over.add(f"{who}: {step}", f"image, MTU {mtu}", MEDIAN, took_ms)
-    return Outcome("ros_trace", "One image over both proxies, step by step", over, [], {})
 
 
 def _figures(said: Mapping[str, float], cores: float) -> dict[str, float]:
@@ -236,13 +200,10 @@ def command(words: Sequence[str] | None = None) -> Options:
     parser = command_line(__doc__, rounds=3, seconds=6.0, quick=quick, has_record=True, has_plot=True)
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     parser.add_argument("--calls", action="store_true", help="a service in place of topics")
-    parser.add_argument("--trace", action="store_true", help="the steps of images, by medians of the last 60")
     options = parse(parser, words)
     options.mtu = tuple(dict.fromkeys(options.mtu or (MTUS[:1] if options.calls else MTUS)))
-    options.is_whole = lambda chosen: not chosen.trace
     return options
 
 
 if __name__ == "__main__":
-    chosen = command()
-    perform(chosen, measure_trace if chosen.trace else measure)
+    perform(command(), measure)

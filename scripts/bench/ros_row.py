@@ -54,7 +54,6 @@ class Row(UndoneOnExit):
         mtu: of every device, the cable included; that of the ring is its own.
         bridged: whether the direct path leads through three bridges instead of one cable.
         ring: the overlay in place of the row: A and B are its first and its last switch.
-        program: of the proxies, before ``--config``.
 
     Raises:
         LocalError: the kernel refuses.
@@ -69,7 +68,6 @@ class Row(UndoneOnExit):
         mtu: int,
         bridged: bool = False,
         ring: Topology | None = None,
-        program: Sequence[str] = ("-m", "proxy.cli.proxy"),
     ) -> None:
         overlay = ring or flat_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
         switches = ring.nodes if ring else MIDDLE
@@ -89,12 +87,12 @@ class Row(UndoneOnExit):
             self._nodes = undo.enter_context(nodes)
             proxies = []
             for side, node in self._machines.items():
-                argv = [*program, "--config", self._admit(side, carried)]
+                argv = ["-m", "proxy.cli.proxy", "--config", self._admit(side, carried)]
                 environment = self._environment(_DOMAINS[side])
                 proxies.append(undo.enter_context(self._lab.start(node, "proxy", argv, environment)))
             for proxy in proxies:
                 proxy.read_line(READY_S)
-            self.proxies = [each.pid for each in proxies]
+            self._proxies = [each.pid for each in proxies]
             self._undo = undo.pop_all()
 
     def node(self, side: str, module: str, role: str, *, direct: bool, **settings: object) -> LabProcess:
@@ -109,7 +107,7 @@ class Row(UndoneOnExit):
 
     def proxies_cpu_s(self) -> float:
         """Return the processor time that both proxies have used."""
-        return sum(processor_s(pid) for pid in self.proxies)
+        return sum(processor_s(pid) for pid in self._proxies)
 
     def _environment(self, domain: int) -> list[str]:
         return ros_environment(self._nodes.files, domain, shared_memory=True)

@@ -5,8 +5,13 @@ bytes; R writes down when each came. The silence of an event is the longest time
 from the event until the flow has been steady again. So it includes the time between two messages, and the delay of this
 machine's scheduler (the row ``nothing``). Lost and doubled count messages over the whole row, all rounds of it.
 
+``tunnels`` has a robot behind a home NAT and a server behind another, which know one border only and open a direct
+tunnel; 100 messages a second. Its silences include the commands of the laboratory that make the event, whose time is a
+column of its own: another address is set by one program, another network or public address by several.
+
     sudo .venv/bin/python scripts/bench/survive.py                      # the whole; writes docs/benchmarks/survive.json
     sudo .venv/bin/python scripts/bench/survive.py --only silent --only cut --rounds 30 --no-save
+    sudo .venv/bin/python scripts/bench/survive.py --only tunnels         # a robot's address changes: ten minutes
     sudo .venv/bin/python scripts/bench/survive.py --only ribs --rounds 1 --dead-s 600 --no-save     # ten minutes
     sudo .venv/bin/python scripts/bench/survive.py --quick --no-save      # one round of each: does it work?
 """
@@ -17,13 +22,14 @@ import random
 import signal
 import time
 from collections import Counter
+from contextlib import ExitStack
 from itertools import pairwise
 from typing import Final
 
 from faults.overlay import LOOK_S, Overlay
 from report import Rounds, Spread, Target, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
-from survive_rows import NEW_TOPICS, ROWS, Row
+from survive_rows import ADDRESS_CHANGES, NEW_TOPICS, ROWS, Row, roaming_flow
 
 from gdp.errors import GdpError
 from lab.process import FailedError, new_run
@@ -35,11 +41,14 @@ DEAD_S: Final = 80.0  # longer than three leases of 24 s
 SETTLE_S: Final = 11.0  # longer than a link that came and went is left out of routes
 STEADY_S: Final = 0.5  # a flow that had no gap above ``STEADY_GAP_S`` for so long is steady
 STEADY_GAP_S: Final = 0.1
+ROAMS_EVERY_S: Final = 3.0
 PATIENCE_S: Final = 40.0  # longer than a lease
 PHASE_S: Final = 0.5  # longest random wait before an event
 LAST_S: Final = 2.0
 SILENCE, RETURN, P99 = "silence, ms", "after undo, ms", "p99, ms"
 PUBLISHED, LOST, REPORTED, DOUBLED, NEVER = "published", "lost", "reported", "doubled", "no return"
+TUNNELS, TUNNELS_ROW, TUNNELS_S = "tunnels", "through tunnels", 0.3
+COMMANDS: Final = "commands, ms"
 
 
 class Flowing:
@@ -143,16 +152,41 @@ def _new_name_s(overlay: Overlay, at: int) -> float:
     return ((arrivals_ns or [time.monotonic_ns()])[0] - begun_ns) / 1e9
 
 
+def measure_tunnels(rounds: int) -> tuple[Rounds, list[Target]]:
+    """Change a robot's address in each way so often; return figures and targets, and raise, as ``measure_row``."""
+    found, targets = Rounds(), list[Target]()
+    with new_run() as run, ExitStack() as stack:
+        robot, homes, flow = roaming_flow(run, stack)
+        for what, act in ADDRESS_CHANGES.items():
+            for at in range(rounds):
+                time.sleep(ROAMS_EVERY_S)
+                since_s = time.monotonic()
+                act(robot, homes)
+                found.add(TUNNELS_ROW, what, COMMANDS, 1e3 * (time.monotonic() - since_s))
+                silence_ms = flow.silence_until_steady_ms(since_s, PATIENCE_S)
+                found.add(TUNNELS_ROW, what, SILENCE, silence_ms)
+                progress(f"  {what}, {at + 1}: {silence_ms:.0f} ms")
+            times_ms = [each for each in found.column(TUNNELS_ROW, what, SILENCE) if each is not None]
+            found.add(TUNNELS_ROW, what, P99, percentile(times_ms, 0.99))
+            targets.append(found.target(f"{what}: {P99}", TUNNELS_ROW, what, P99, 1e3 * TUNNELS_S, at_most=True))
+        flow.close()
+    for column, count in ((PUBLISHED, len(flow.sent_s)), (LOST, flow.lost), (DOUBLED, flow.doubled)):
+        found.add(TUNNELS_ROW, "whole run", column, count)
+        target = None if column == PUBLISHED else 0.0
+        targets.append(found.target(f"messages {column}", TUNNELS_ROW, "whole run", column, target, at_most=True))
+    return found, targets
+
+
 def measure(options: Options) -> Outcome:
     """Measure every row; one that fails is noted."""
     over, targets, notes = Rounds(), list[Target](), list[str]()
-    for name in options.only or ROWS:
-        row = ROWS[name]
-        rounds = min(options.rounds, NEW_TOPICS) if row.new_name_s is not None else options.rounds
-        rounds = min(rounds, 3) if row.holds else rounds
-        progress(f"{name}: {row.what}, {rounds} times")
+    for name in options.only or [*ROWS, TUNNELS]:
+        row, rounds = ROWS.get(name), options.rounds
+        if row is not None:
+            rounds = min(rounds, NEW_TOPICS if row.new_name_s is not None else rounds, 3 if row.holds else rounds)
+        progress(f"{name}: {row.what if row else TUNNELS_ROW}, {rounds} times")
         try:
-            found, asked = measure_row(row, rounds, options)
+            found, asked = measure_row(row, rounds, options) if row else measure_tunnels(rounds)
             over.values |= found.values
             targets += asked
         except GdpError as error:
@@ -166,6 +200,6 @@ def measure(options: Options) -> Outcome:
 if __name__ == "__main__":
     quick = {"rounds": 1, "dead_s": 3.0, "settle_s": 0.0}
     parser = command_line(__doc__, rounds=ROUNDS, quick=quick, has_record=True)
-    parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
+    parser.add_argument("--only", action="append", choices=[*ROWS, TUNNELS], help="this row; may be repeated")
     parser.set_defaults(dead_s=DEAD_S, settle_s=SETTLE_S)
     run_bench(parser, measure)

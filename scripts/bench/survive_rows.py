@@ -14,7 +14,8 @@ I/O. Through ``faults.overlay``. P publishes to R at an even rate; ``-`` is a li
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -22,14 +23,23 @@ from typing import Final
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 
+from gdp.host.run_registry import Run
+from gdp.trust.right import Right
 from lab.faults import Fault, FaultKind
+from lab.internet.access import Access
+from lab.internet.flow import NumberedFlow, open_sessions
+from lab.internet.host import Host
+from lab.internet.laboratory import Laboratory
+from lab.internet.site import Site
 from lab.namespaces import received
+from lab.process import until
 from lab.topology import Link, ends_of, make_topology
 
 CUT, KILL = FaultKind.CUT, FaultKind.KILL_SWITCH
 TOPIC: Final = "/steady"
 NEW_TOPICS: Final = 40
 _DEARER: Final = 12
+_TUNNEL_S: Final = 40.0
 _COUNT_S: Final = 0.1  # time of counting frames, to find the flow's path
 
 
@@ -172,4 +182,26 @@ ROWS: Final[dict[str, Row]] = {
     "border": Row("border killed", 0.5, _borders, _on_path(KILL, "b1", b2="switch a2", b3="switch a3")),
     "rib": Row("any one RIB of two killed", 0.0, _two_ribs, _kill_one_rib, new_name_s=0.3),
     "ribs": Row("all RIBs dead", 0.0, _two_ribs, _kill_all_ribs, holds=True),
+}
+
+
+def roaming_flow(run: Run, stack: ExitStack) -> tuple[Host, list[Site], NumberedFlow]:
+    """Return a robot, the sites of its homes, and its flow to a server through a direct tunnel."""
+    laboratory = stack.enter_context(Laboratory(run))
+    homes = [laboratory.add_site(f"home{number}", Access.PORT_RESTRICTED) for number in (1, 2)]
+    robot = laboratory.add_host("robot", homes[0])
+    rights = [{TOPIC: [Right.PUBLISH]}, {TOPIC: [Right.READ]}]
+    overlay, server, (sender, reader) = open_sessions(robot, stack, rights)
+    subscription, publisher = reader.subscribe(TOPIC), sender.publisher(TOPIC)
+    publisher.wait_for_readers(timeout_s=_TUNNEL_S)
+    until(lambda: overlay.tunnels(robot).get(server.label, {}).get("up"), lambda: "a direct tunnel", _TUNNEL_S)
+    return robot, homes, NumberedFlow(publisher, subscription)
+
+
+ADDRESS_CHANGES: Final[dict[str, Callable[[Host, Sequence[Site]], object]]] = {
+    "nothing": lambda *_: None,
+    "another address in the same network": lambda robot, _: robot.renumber(),
+    "another network": lambda robot, homes: robot.attach(homes[robot.site() is homes[0]]),
+    "another public address": lambda robot, _: robot.site().renumber(),
+    "the NAT forgets its mappings": lambda robot, _: robot.site().flush_mappings(),
 }

@@ -23,7 +23,7 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
-from gdp.trust.right import Right
+from gdp.trust.right import Right, right_on
 from lab.topology import Attachment, Topology
 
 Yaml: TypeAlias = "dict[str, object]"
@@ -58,8 +58,7 @@ class Carried:
 
     def right(self, side: Side) -> Right:
         """Return the right that the proxy of one side needs."""
-        expose, imported = (Right.PUBLISH, Right.READ) if self.kind == "topic" else (Right.SERVE, Right.CALL)
-        return expose if side == "expose" else imported
+        return right_on(self.kind, gives=side == "expose")
 
     def rule(self, owner: Path) -> Yaml:
         """Return its rule in either ``proxy.yaml``."""

@@ -12,7 +12,6 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
 import ros
 from report import Rounds
-from ros_trace import steps_of
 from skeleton import Options, Trial
 
 from gdp.metadata import Metadata
@@ -66,16 +65,3 @@ def test_targets_are_compared_with_the_results_of_the_rounds(options: Options) -
     assert targets
     assert [target.what for target in targets if target.measured is None] == []
     assert all(target.met for target in targets if target.target is not None)
-
-
-def test_the_steps_of_a_trace_add_up_to_its_whole_time() -> None:
-    seams = {"talk": (0, 1), "take": (2, 3), "expose": (4, 6), "seal": (7, 8), "send": (8, 11), "receive": (9, 12)}
-    seams |= {"open": (13, 14), "verify": (14, 15), "import": (17, 22), "publish": (18, 20), "hear": (24, 25)}
-    calls = {
-        seam: [((100 * image + begin) * 10**6, (100 * image + end) * 10**6) for image in range(5)]
-        for seam, (begin, end) in seams.items()
-    }
-    steps = steps_of(calls)
-    assert sum(took_ms for step, took_ms in steps.items() if step[0].isdigit()) == steps["all"] == 24.0
-    assert steps["of 5: sealing"] == 1.0
-    assert steps_of({"talk": calls["talk"], "hear": calls["hear"]}) == {"all": 24.0}

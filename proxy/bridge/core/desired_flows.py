@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ros_names import NODE_TYPE, Kind, is_pattern
+from gdp.trust.right import Right, right_on
 from proxy.bridge.core.action_interface import action_of
 from proxy.bridge.core.node_rules import nodes_in
 from proxy.bridge.faults import Fault
@@ -20,8 +21,11 @@ from proxy.config.matching import choose
 from proxy.config.rule import Rule
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 
-_SHOWS: Final[dict[Kind, Role]] = {"topic": Role.PUBLISHES, "service": Role.SERVES, "action": Role.SERVES}
-_WANTS: Final[dict[Kind, Role]] = {"topic": Role.SUBSCRIBES, "service": Role.CALLS, "action": Role.CALLS}
+_CALLED: Final[tuple[Kind, ...]] = ("service", "action", "node")
+ROLES: Final[dict[bool, dict[Kind, Role]]] = {  # of a local node, by whether the name is exposed, and by kind
+    True: {"topic": Role.PUBLISHES, **dict.fromkeys(_CALLED, Role.SERVES)},
+    False: {"topic": Role.SUBSCRIBES, **dict.fromkeys(_CALLED, Role.CALLS)},
+}
 
 _PLAIN: Final[tuple[Kind, ...]] = ("topic", "service")
 _KEPT, _KEPT_MIN = 4, 1_024  # names in a ``RuleMemo``: of each that the graph shows, and above
@@ -35,6 +39,11 @@ class FlowSpec(NamedTuple):
     type_name: str
     name: Name
     rule: Rule
+
+    @property
+    def right(self) -> Right:
+        """Return the right on the overlay name that it takes."""
+        return right_on(self.rule.kind, gives=self.is_exposed)
 
     def has_short_queues(self, ros: int) -> bool:
         """Return whether its local nodes drop requests or responses that come faster than they take them.
@@ -88,7 +97,7 @@ class RuleMemo:
 def denied(rules: Sequence[Rule], graph: Graph, *, is_exposed: bool) -> Iterator[DeniedName]:
     """Yield the denied names of one direction: those of the graph, and those that a rule states."""
     shown = {(rule.kind, rule.local) for rule in rules if rule.is_denied}
-    shown |= _shown(graph, _SHOWS if is_exposed else _WANTS).keys()
+    shown |= _shown(graph, ROLES[is_exposed]).keys()
     for kind, local in sorted(shown):
         meant = (rule.denied_by(local) for rule in rules if rule.kind == kind and rule.means(local))
         pattern = next((each for each in meant if each is not None), None)
@@ -115,7 +124,7 @@ def exposed(
     of_nodes = {id(each): each for each, _ in nodes_in(rules, graph).values()}
     for each in of_nodes.values():  # one for all nodes of a pattern
         yield FlowSpec(True, each.local, NODE_TYPE, each.overlay_name_of(each.local, NODE_TYPE), each)
-    shown = _shown(graph, _SHOWS)
+    shown = _shown(graph, ROLES[True])
     memo.trim(len(shown))
     for (kind, local), types in shown.items():
         key, of_node = (kind, local, frozenset(types)), by_node.get((kind, local))
@@ -162,7 +171,7 @@ def imported(
         memo: of these rules and delegations; None: a new one.
     """
     seen: set[Name] = set()
-    wanted = _shown(graph, _WANTS)
+    wanted = _shown(graph, ROLES[False])
     had: dict[tuple[Kind, str], set[str]] = {}
     memo = RuleMemo() if memo is None else memo
     memo.trim(len(wanted))

@@ -16,7 +16,7 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ros_names import NODE_TYPE
 from gdp.trust.delegation import Delegation
-from gdp.trust.right import Right
+from gdp.trust.right import Right, right_on
 from proxy.bridge.core.desired_flows import FlowSpec, exposed, imported
 from proxy.bridge.core.node_rules import nodes_in, rules_of_node
 from proxy.config import matching
@@ -76,7 +76,7 @@ def _of_machine(
     for rules, known, is_exposed in ((config.expose, offered, True), (config.imports, wanted, False)):
         for name, metadata in known.items():
             if matching.imported(rules, name, metadata) is not None:
-                rights.setdefault(name, set()).add(_right(metadata, is_exposed=is_exposed))
+                rights.setdefault(name, set()).add(right_on(metadata["kind"], gives=is_exposed))
     both = {**wanted, **offered}
     for node in rights.keys() & brought.keys():
         has_node = Right.SERVE in rights[node]
@@ -84,7 +84,7 @@ def _of_machine(
             name, metadata = rule.overlay_name, rule.overlay_metadata
             is_exposed = has_node is not is_heard
             if has_node or not is_heard or matching.imported(config.expose, name, metadata) is not None:
-                rights.setdefault(name, set()).add(_right(metadata, is_exposed=is_exposed))
+                rights.setdefault(name, set()).add(right_on(metadata["kind"], gives=is_exposed))
                 both[name] = metadata
     found = [RequiredDelegation(name, both[name], frozenset(each)) for name, each in rights.items()]
     return sorted(found, key=lambda need: (str(need.metadata["kind"]), str(need.metadata["name"])))
@@ -137,9 +137,3 @@ def _of(rules: Iterable[Rule], owner: PublicKey) -> Iterator[Rule]:
 
 def _rules_at(config: ProxyConfig, rules: Iterable[Rule], at: int) -> list[Rule]:
     return [rule for rule in rules if config.endpoint_of(rule) == at]
-
-
-def _right(metadata: Metadata, *, is_exposed: bool) -> Right:
-    if metadata["kind"] == "topic":
-        return Right.PUBLISH if is_exposed else Right.READ
-    return Right.SERVE if is_exposed else Right.CALL
