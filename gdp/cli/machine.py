@@ -24,7 +24,7 @@ from gdp.host.interruption import Interrupted, interruptible
 from gdp.intervals import TICK_S
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
-from gdp.terminal import echo
+from gdp.terminal import echo, unblocked
 
 BORDER_SEEN_S: Final = 20.0
 
@@ -80,6 +80,7 @@ def run_programs(programs: Sequence[MachineProgram], started: Callable[[], Await
     Raises:
         LocalError: a program cannot be started at all.
     """
+    sys.stderr = unblocked(sys.stderr)  # it has the output of all programs, which are to be restarted meanwhile
     set_up_logging(verbose=False)
     say(f"running {', '.join(each.name for each in programs)} in the foreground; Ctrl-C ends them")
     failures = Failures()

@@ -16,7 +16,7 @@ import orjson
 import typer
 
 from gdp.errors import ConfigError, GdpError, LocalError
-from gdp.terminal import echo
+from gdp.terminal import echo, unblocked
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -81,9 +81,12 @@ _Settings = TypeVar("_Settings", bound="BaseModel")
 
 @contextlib.contextmanager
 def running(logs: Logs) -> Iterator[None]:
-    """Log as the options say; print an error of ours as one line on standard error, and exit with code 2."""
+    """Log as the options say; print an error of ours as one line on standard error, and exit with code 2.
+
+    A node never blocks on its output: lines that are not read are dropped and counted.
+    """
     set_up_logging(verbose=logs.verbose, level=logs.log_level, form=logs.log_format)
-    with failing_clearly():
+    with contextlib.redirect_stdout(unblocked(sys.stdout)), failing_clearly():
         yield
 
 
@@ -98,7 +101,8 @@ def set_up_logging(
     """
     least = logging.DEBUG if verbose else logging.WARNING if quiet else getattr(logging, level.name)
     module = " %(name)s" if least <= logging.DEBUG else ""
-    logging.basicConfig(level=least, stream=sys.stderr, format=f"%(asctime)s %(levelname)s{module} %(message)s")
+    form_of_line = f"%(asctime)s %(levelname)s{module} %(message)s"
+    logging.basicConfig(level=least, stream=unblocked(sys.stderr), format=form_of_line)
     for handler in logging.getLogger().handlers:
         handler.addFilter(_is_ours_or_serious)
         if form is Format.JSON:

@@ -239,7 +239,7 @@ class NameResolver:
             known = self.cache.of(location.name, now_s)
             has_left |= any(each.switch == self._me and each.right in _ACCEPTS_FRAMES for each in known)
         if not has_left and (not is_ours or is_repeated):
-            self._answered(location.name, now_s)
+            self._answered(location.name, now_s, location.expires_s - now_s)
 
     def receive_removal(self, name: Name, advertiser: Name, now_s: float) -> None:
         """Remove one advertiser of a name: it has withdrawn, or its proofs are no longer valid."""
@@ -273,8 +273,11 @@ class NameResolver:
         else:
             query.passed_over.clear()
 
-    def _answered(self, name: Name, now_s: float) -> None:
-        """Close the query for a name, or schedule the renewal of its watch."""
+    def _answered(self, name: Name, now_s: float, lease_s: float = NEVER_S) -> None:
+        """Close the query for a name, or schedule the renewal of its watch; ``lease_s``: of the location in the answer.
+
+        A RIB sends no location that only extends a lease, so the renewal comes before the lease ends.
+        """
         if (query := self._queries.get(name)) is None:
             return
         query.passed_over.clear()
@@ -282,7 +285,9 @@ class NameResolver:
             self._remove(name)
             return
         self._in_flight.discard(name)
-        self.requests.answered(name, now_s + self._renewals(query).most_s)
+        again_s = now_s + max(min(self._renewals(query).most_s, lease_s / 2), RETRY_S)
+        self.requests.answered(name, again_s)
+        self.requests.hasten(name, again_s)  # of several locations, and of one that was not asked for
 
     # -- time, and the RIB
 

@@ -15,19 +15,22 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gdp.intervals import DETECT_MULTIPLIER, SCAPY_KEEPALIVE_MS
+from gdp.intervals import DETECT_MULTIPLIER, OWING, SCAPY_KEEPALIVE_MS
 from gdp.names import Name
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.draws import draws
 from tests.gdp.switch.nat import Nat, permits
 from tests.journeys.flows import LEASE_S, LEASES, Flow, advertise
-from tests.journeys.services import Party, meet
+from tests.journeys.services import Party, meet, outlive, work
 from tests.journeys.tunnelled import BORDER, SITES, Tunnelled, tunnelled
 from tests.lanes import long_example
 
 STEP_S, LATE_S, LOOK_S, SETTLE_S = 0.25, 1.0, 0.05, 40.0
 LEASES_S: Final = LEASES * LEASE_S
 DEAD_S: Final = DETECT_MULTIPLIER * SCAPY_KEEPALIVE_MS / 1e3
+DETECT_S: Final = OWING.lease_s  # of a dead neighbour, by keepalives
 FIRST_S: Final = 1.0  # the first fault, after the first message
 RIBS: Final = ("lab", "lab#2")
 PROGRAMS: Final = {"border": (BORDER, *RIBS), "switch of the border": (BORDER,), "RIB": RIBS[:1], "other RIB": RIBS[1:]}
@@ -237,3 +240,34 @@ def test_a_machine_that_lost_the_border_alone_keeps_its_port_and_reaches_the_oth
         traffic.check(set(permutations(SITES, 2)))
         assert bed.machines["a"].rebinds == 0
         assert bed.world.switches["a"].rib is not None
+
+
+SHORT_S: Final = 2.0  # lease of the names of an application that states its own
+
+
+@pytest.mark.parametrize("holder", ["a", "b"])
+def test_calls_go_on_if_the_border_dies_when_the_leases_known_from_its_rib_are_closest_to_their_end(
+    holder: str,
+) -> None:
+    links = (Link("a", "b"), Link("a", BORDER), Link("b", BORDER))
+    plan = Topology(links, (DomainPlan("lab", ("a", "b", BORDER)),), (Attachment(BORDER, "rib", "rib"),))
+    world = Simulation(topology=plan, keepalive_ms=None)
+    world.lease_s = SHORT_S  # of the members; the switches keep theirs
+    for each in ("a", "b"):
+        world.add_member(f"{each}/member", each)
+    assert world.run_until_attached()
+    client, server = Party(world, "a/member", Right.CALL), Party(world, "b/member", Right.SERVE)
+    assert meet(world, client, server)
+    known, network = world.switches[holder].state.resolver.cache, world.network
+
+    def is_at_its_end() -> bool:
+        """Return whether some location is known, and one lease ends before the loss of the border is noticed."""
+        ends_s = [each.expires_s for each in known.all()]
+        return bool(ends_s) and min(ends_s) - network.now.mono_s < DETECT_S
+
+    client.publish(b"before")
+    assert work(world, server, client, until_s=1.0, have=1)
+    network.run(3 * SHORT_S, is_at_its_end)
+    network.stop(BORDER)
+    world.kill_rib("lab")
+    outlive(world, client, server)

@@ -213,3 +213,23 @@ def test_the_echo_of_a_relayed_advertisement_answers_no_query_until_it_is_repeat
     resolver.receive_location(location(TOPIC), RETRY_S + 0.01, is_ours=True)
     assert due(resolver, 2 * RETRY_S + 0.1) == []
     assert due(resolver, ADVERTISEMENT.lease_s / 4 + 1) == watch
+
+
+def test_a_watch_is_renewed_well_before_the_lease_of_any_location_of_its_answer_ends() -> None:
+    resolver = NameResolver(ME)
+    resolver.watch(TOPIC, 0.0)
+    watch = due(resolver, 0.0)
+    short = replace(location(TOPIC, Right.PUBLISH, expires_s=2.0), advertiser=name("short"))
+    for each in (location(TOPIC, Right.PUBLISH), short, location(TOPIC, Right.PUBLISH)):
+        resolver.receive_location(each, 0.0)
+    assert due(resolver, 0.9) == []
+    assert due(resolver, 1.0) == watch
+
+
+def test_a_location_whose_lease_is_about_to_end_is_queried_no_sooner_than_after_a_retry() -> None:
+    resolver = NameResolver(ME)
+    resolver.watch(TOPIC, 0.0)
+    watch = due(resolver, 0.0)
+    resolver.receive_location(location(TOPIC, Right.PUBLISH, expires_s=0.01), 0.0)
+    assert due(resolver, 0.9 * RETRY_S) == []
+    assert due(resolver, RETRY_S) == watch
