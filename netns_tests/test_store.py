@@ -80,7 +80,7 @@ def test_a_replayed_drive_is_exported_as_it_was_recorded(tmp_path: Path) -> None
         assert done.returncode == 0, done.stdout + done.stderr
         said = json.loads(done.stdout.splitlines()[-1])
         assert (said["event"], said["unconfirmed"]) == ("done", [])
-        assert {each["topic"] for each in said["held"]} == set(TOPICS)
+        assert {topic for each in said["held"] for topic in each["topics"]} == set(TOPICS)
         assert all(each["messages"] and each["bytes"] and each["holders"] == 1 for each in said["held"])
         exported = lab.run("gdp", "store", "export", *TOPICS, "--node", "investigator", "-o", str(incident), "--json")
         assert exported.returncode == 0, exported.stdout + exported.stderr

@@ -19,7 +19,7 @@ from gdp.client.send_options import SendOptions
 from gdp.errors import GdpError, StoreError
 from gdp.names import Name
 from gdp.service.replication import Mode, Replication
-from gdp.session.keeping import CapsuleKeeper, KeptTopic
+from gdp.session.keeping import CapsuleKeeper, KeptCapsule
 from gdp.session.protocol.client_core import Call, ClientCore
 from gdp.session.protocol.server_core import ServerCore
 from gdp.stores.capsule_store import CapsuleStore, StoreLimits
@@ -169,7 +169,7 @@ class Keeping:
     holders: tuple[str, ...] = (STORE,)
     around_ns: tuple[int, int] | None = None
     keeper: CapsuleKeeper = field(init=False)
-    kept: KeptTopic = field(init=False)
+    kept: KeptCapsule = field(init=False)
     step_s: float = _STEP_S
     worked_s: float = 0.0
 
@@ -237,7 +237,8 @@ def records_at(store: CapsuleStore, capsule: Name, *, time_ns: int = 0) -> bytes
 
 def read_from(holder: Holder, keeping: Keeping, from_ns: int = 0) -> tuple[list[Kept], CapsuleReader]:
     """Return what a reader with the topic's secrets gets from a holder, and the reader."""
-    reader = CapsuleReader(keeping.kept.ring.descriptor, keeping.flow.topic.secrets, from_ns=from_ns)
+    topic = keeping.flow.topic
+    reader = CapsuleReader(keeping.kept.ring.descriptor, {topic.name: topic.secrets}, from_ns=from_ns)
     kept = list[Kept]()
     while not reader.is_done:
         answer = holder.store.handle(reader.next_request().to_cbor(), Name(b"r" * 32))
@@ -248,5 +249,5 @@ def read_from(holder: Holder, keeping: Keeping, from_ns: int = 0) -> tuple[list[
 def opened(data: bytes, keeping: Keeping) -> list[Kept]:
     """Return the messages in records, opened with the secrets of the flow's topic."""
     descriptor, topic = keeping.kept.ring.descriptor, keeping.flow.topic
-    opener = CapsuleOpener(topic.name, descriptor.writer.name, topic.secrets, descriptor.key)
+    opener = CapsuleOpener(descriptor, {topic.name: topic.secrets})
     return [each for wire in split(data) for each in opener.open(Record.from_wire(wire))]

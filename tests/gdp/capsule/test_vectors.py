@@ -43,11 +43,11 @@ def test_records_leaves_heads_and_roots_are_as_published() -> None:
 
 def test_the_epochs_secret_opens_it_and_another_epochs_opens_nothing() -> None:
     for epoch, opens in ((FILE["epoch"], True), (FILE["epoch"] + 1, False)):
-        secrets = {epoch: bytes.fromhex(FILE["secret"])}
-        opener = CapsuleOpener(DESCRIPTOR.topic.name, DESCRIPTOR.writer.name, secrets, DESCRIPTOR.key)
+        topic, secrets = DESCRIPTOR.topic.name, {epoch: bytes.fromhex(FILE["secret"])}
+        opener = CapsuleOpener(DESCRIPTOR, {topic: secrets})
         kept = [each for wire in WIRES for each in opener.open(Record.from_wire(wire))]
         assert [{"sequence": each.sequence, "message": each.message.hex()} for each in kept] == FILE["opened"] * opens
-        assert opener.description.hex() == FILE["description"] * opens
+        assert opener.descriptions.get(topic, b"").hex() == FILE["description"] * opens
         assert opener.closed == ({} if opens else {FILE["epoch"]: 4})
         assert {each.incarnation for each in kept} <= {FILE["incarnation"]}
     assert DESCRIPTOR.writer.name == Name.from_text(FILE["descriptor"]["writer"])
