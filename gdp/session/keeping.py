@@ -380,7 +380,10 @@ class CapsuleKeeper:
         if before is not None:
             begun_ms = max(begun_ms, before.ring.descriptor.begun_ms + 1)
             before.supersede(int(unix_s * 1e9))
-            self.ended[before.name] = before
+            if before.ring.next:
+                self.ended[before.name] = before
+            else:
+                before.ring.remove()
         descriptor = Descriptor.of(rights, self._identity.membership, begun_ms)
         for name, each in list(self.ended.items()):
             if each.ring.continues(folder, descriptor):
@@ -442,9 +445,10 @@ class CapsuleKeeper:
                 self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
         for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
             kept = self.ended.pop(name)
-            kept.ring.close()
             if kept.is_superseded:
                 kept.ring.remove()
+            else:
+                kept.ring.close()
 
     def flush(self, unix_s: float) -> None:
         """Append what was published so far, for ``is_uploaded``."""

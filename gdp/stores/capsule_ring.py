@@ -136,7 +136,8 @@ class CapsuleRing:
                 log.warning("capsule is not uploaded path=%s reason=%s", place, error)
 
     def remove(self) -> None:
-        """Remove a closed ring from the disk."""
+        """Close it, and remove it from the disk."""
+        self.close()
         shutil.rmtree(self._segments.folder)
 
     def close(self) -> None:

@@ -94,7 +94,7 @@ class TopicKeeper:
 
     def _mark(self, name: str, topics: set[Name], unix_s: float) -> int:
         found = [kept for topic, kept in self.capsules.topics.items() if topic in topics]
-        for kept in set(found):
+        for kept in {each.name: each for each in found}.values():
             kept.mark(name, int(unix_s * 1e9))
         return len(found)
 

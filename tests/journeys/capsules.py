@@ -168,6 +168,7 @@ class Keeping:
     most_bytes: int = 1 << 24
     holders: tuple[str, ...] = (STORE,)
     around_ns: tuple[int, int] | None = None
+    capsule: str | None = None
     keeper: CapsuleKeeper = field(init=False)
     kept: KeptCapsule = field(init=False)
     step_s: float = _STEP_S
@@ -177,10 +178,20 @@ class Keeping:
         world, member = self.flow.world, self.flow.member
         identity = next(each for each in world.identities.values() if each.name == member.name)
         self.keeper = CapsuleKeeper(member, identity, self.folder, start=7, pool=Inline())
-        services = [world.topic(each, member, [Right.CALL], kind="service") for each in self.holders]
-        unix_s = world.network.now.unix_s
+        self.keep(self.flow)
+
+    def keep(self, flow: Flow) -> None:
+        """Keep the topic of a flow; the latest one's capsule is ``kept``."""
+        world = flow.world
+        services = [world.topic(each, flow.member, [Right.CALL], kind="service") for each in self.holders]
         self.kept = self.keeper.keep(
-            self.flow.topic, self.flow.publisher, services, self.most_bytes, unix_s, self.around_ns
+            flow.topic,
+            flow.publisher,
+            services,
+            self.most_bytes,
+            world.network.now.unix_s,
+            self.around_ns,
+            self.capsule,
         )
 
     def work(self) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from gdp.capsule.audit import Audit
 from gdp.capsule.chain import Chain
@@ -12,6 +15,7 @@ from gdp.capsule.checkpoint import Checkpoint
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.opening import CapsuleOpener
 from gdp.capsule.record import Record, RecordType, leaf_of
+from gdp.errors import StatementError
 from gdp.names import Name
 
 FILE: dict[str, Any] = json.loads((Path(__file__).parents[2] / "vectors" / "capsule.json").read_text())
@@ -24,6 +28,17 @@ def test_the_name_digests_topic_writer_and_beginning() -> None:
     assert DESCRIPTOR.name.hex() == FILE["descriptor"]["name"]
     assert DESCRIPTOR.key.compressed.hex() == FILE["descriptor"]["writer_key"]
     assert DESCRIPTOR.to_cbor().hex() == FILE["descriptor"]["wire"]
+
+
+def test_a_name_of_several_topics_digests_their_names() -> None:
+    several = FILE["several"]
+    descriptor = Descriptor.from_cbor(bytes.fromhex(several["wire"]))
+    assert (descriptor.name.hex(), descriptor.to_cbor().hex()) == (several["name"], several["wire"])
+    assert [each.hex() for each in descriptor.topics] == several["topics"]
+    assert dict(descriptor.metadata) == several["metadata"]
+    assert several["metadata"]["topics"] == hashlib.sha256(b"".join(map(bytes.fromhex, several["topics"]))).hexdigest()
+    with pytest.raises(StatementError):
+        descriptor.check_right(descriptor.begun_ms / 1e3)
 
 
 def test_records_leaves_heads_and_roots_are_as_published() -> None:
