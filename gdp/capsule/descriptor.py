@@ -57,7 +57,7 @@ class Descriptor(FieldSet):
     ] = ()
 
     @classmethod
-    def of(cls, rights: Sequence[TopicRight], certificate: bytes, begun_ms: int) -> Descriptor:
+    def of_topics(cls, rights: Sequence[TopicRight], certificate: bytes, begun_ms: int) -> Descriptor:
         """Return that of a capsule of one or more topics."""
         return cls(rights[0].topic, certificate, rights[0].chain, begun_ms, tuple(rights[1:]))
 

@@ -384,7 +384,7 @@ class CapsuleKeeper:
                 self.ended[before.name] = before
             else:
                 before.ring.remove()
-        descriptor = Descriptor.of(rights, self._identity.membership, begun_ms)
+        descriptor = Descriptor.of_topics(rights, self._identity.membership, begun_ms)
         for name, each in list(self.ended.items()):
             if each.ring.continues(folder, descriptor):
                 self.ended.pop(name).ring.close()

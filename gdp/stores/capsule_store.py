@@ -352,20 +352,8 @@ class CapsuleStore(ClosedOnExit):
         offset, data = segments.read(offset, BATCH_BYTES)
         described = b""
         if data and (request.time_ns or offset != request.offset):
-            described = self._described(capsule, number_of(data))
+            described = _described(self.index, capsule, number_of(data))
         return HolderAnswer(head=segments.end, offset=offset, data=data, described=described)
-
-    def _described(self, capsule: StoredCapsule, number: int) -> bytes:
-        """Return the latest description of each topic before a record."""
-        found, topics = dict[bytes, bytes](), len(capsule.descriptor.topics)
-        query = "SELECT wire FROM descriptions WHERE capsule = ? AND number < ? ORDER BY number DESC"
-        with self.index.reading() as index:
-            for (wire,) in index.execute(query, (capsule.name, number)):
-                found.setdefault(decode(Record.from_wire(wire).frames[0]).destination, wire)
-                if len(found) == topics:
-                    break
-        sizes = accumulate(map(len, found.values()))
-        return b"".join(wire for wire, size in zip(found.values(), sizes, strict=True) if size <= BATCH_BYTES)
 
     def _compare(self, data: bytes) -> HolderAnswer:
         """Return the total, or what the sender of these lines lacks in part."""
@@ -551,6 +539,19 @@ def _marks(index: TransactionFile, name: Name) -> list[bytes]:
         found = [row[0] for row in open_index.execute(query, (name, _MARKS_MAX))]
     sizes = accumulate(map(len, found))
     return [wire for wire, size in zip(found, sizes, strict=True) if size <= BATCH_BYTES][::-1]
+
+
+def _described(index: TransactionFile, capsule: StoredCapsule, number: int) -> bytes:
+    """Return the latest description of each topic before a record."""
+    found, topics = dict[bytes, bytes](), len(capsule.descriptor.topics)
+    query = "SELECT wire FROM descriptions WHERE capsule = ? AND number < ? ORDER BY number DESC"
+    with index.reading() as open_index:
+        for (wire,) in open_index.execute(query, (capsule.name, number)):
+            found.setdefault(decode(Record.from_wire(wire).frames[0]).destination, wire)
+            if len(found) == topics:
+                break
+    sizes = accumulate(map(len, found.values()))
+    return b"".join(wire for wire, size in zip(found.values(), sizes, strict=True) if size <= BATCH_BYTES)
 
 
 def index_of(folder: Path) -> TransactionFile:

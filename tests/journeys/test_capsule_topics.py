@@ -216,7 +216,7 @@ def test_a_writer_needs_a_right_for_each_topic(drive: Drive) -> None:
     world = drive.flows[0].world
     reader = world.topic("/cmd_vel", drive.flows[0].member, [Right.READ]).delegation
     without = descriptor.rights[0], TopicRight(reader.subject, reader.chain), descriptor.rights[2]
-    forged = Descriptor.of(without, descriptor.certificate, descriptor.begun_ms)
+    forged = Descriptor.of_topics(without, descriptor.certificate, descriptor.begun_ms)
     assert forged.name == descriptor.name
     with pytest.raises(StatementError):
         forged.check_right(world.network.now.unix_s)
@@ -246,11 +246,11 @@ def test_the_name_depends_on_each_topic_and_their_number_is_bounded(drive: Drive
     descriptor = drive.keeping.kept.ring.descriptor
     rights = descriptor.rights
     names = {
-        Descriptor.of(each, descriptor.certificate, descriptor.begun_ms).name
+        Descriptor.of_topics(each, descriptor.certificate, descriptor.begun_ms).name
         for each in (rights, rights[:2], rights[:1], rights[::-1])
     }
     assert len(names) == 4
     assert Descriptor.from_cbor(descriptor.to_cbor()) == descriptor
-    too_many = Descriptor.of([rights[0]] * (TOPICS_MAX + 1), descriptor.certificate, 1)
+    too_many = Descriptor.of_topics([rights[0]] * (TOPICS_MAX + 1), descriptor.certificate, 1)
     with pytest.raises(StatementError):
         Descriptor.from_cbor(too_many.to_cbor())
