@@ -178,7 +178,8 @@ class Audit:
 
     def _verify(self, record: Record) -> None:
         try:
-            verify_frames(record.sealed, self._key)
+            for frames in record.sealed:
+                verify_frames(frames, self._key)
         except RemoteError as error:
             self._find(Damage.ALTERED, record.number, record.number, str(error))
 

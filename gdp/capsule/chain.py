@@ -36,13 +36,12 @@ class Chain:
         proven: the same behind the last checkpoint.
         leaves: hashes of the records from the last checkpoint on.
         time_ns: of the last record.
-        sequence: sequence number behind the last message.
     """
 
     def __init__(self, name: Name, key: PublicKey) -> None:
         self.name = name
         self._key = key
-        self.number = self.first = self.time_ns = self.sequence = 0
+        self.number = self.first = self.time_ns = 0
         self.head = self.proven = hashlib.sha256(b"gdp-capsule-1" + name).digest()
         self.leaves: list[bytes] = []
 
@@ -84,8 +83,6 @@ class Chain:
             self.leaves, self.first, self.proven = [], record.number, self.head
         self.leaves.append(leaf)
         self.number, self.time_ns = record.number + 1, record.time_ns
-        if record.messages:
-            self.sequence = record.sequence + record.messages
 
 
 class ChainWriter:

@@ -65,7 +65,7 @@ class HolderAnswer(FieldSet):
         head: behind the last byte that is on its disk, or in its bucket: confirmed.
         offset: what is to be appended next; of records that were read, where they begin: as asked, or behind a gap.
         data: records, or a part of the last one; the holder's total.
-        described: the record with the description that holds where ``data`` begins, if records before it are skipped.
+        described: the records with the topics' descriptions that hold where ``data`` begins, if records are skipped.
         descriptors: of the listed capsules, or of those that the client lacks in part.
     """
 

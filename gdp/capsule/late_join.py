@@ -128,7 +128,7 @@ class LateJoin:
     def _read(self, writer: _Writer, span_ns: int) -> None:
         """Read all from some time before now on."""
         writer.span_ns, writer.last = min(span_ns, self._age_ns), (0, 0)
-        begin, secrets = max(self._now_ns - writer.span_ns, 1), self._topic.secrets
+        begin, secrets = max(self._now_ns - writer.span_ns, 1), {self._topic.name: self._topic.secrets}
         writer.readers = deque(CapsuleReader(each, secrets, from_ns=begin) for each in writer.descriptors)
         writer.past.clear()
 

@@ -5,7 +5,7 @@ Sans-I/O. Records of another time are skipped; what is damaged or missing is nam
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import Final, NamedTuple
 
@@ -13,16 +13,18 @@ from gdp.capsule.audit import Audit
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
 from gdp.capsule.opening import CapsuleOpener, Kept
-from gdp.capsule.record import RECORD_MAX_BYTES, RECORD_MIN_BYTES, Record, find, size_of
+from gdp.capsule.record import RECORD_MAX_BYTES, RECORD_MIN_BYTES, Record, find, size_of, split
 from gdp.client.key_epochs import Secrets
 from gdp.errors import GdpError, RemoteError
+from gdp.names import Name
 
 _END_NS: Final = (1 << 63) - 1
 
 
 class Lost(NamedTuple):
-    """Messages of one incarnation of the writer that no record has, by sequence number, both included."""
+    """Messages of one topic and incarnation of the writer that no record has, by sequence number, both included."""
 
+    topic: Name
     incarnation: int
     first: int
     last: int
@@ -42,7 +44,7 @@ class CapsuleReader:
     """Reader of one capsule.
 
     Args:
-        secrets: of the topic, by epoch; messages of other epochs stay closed.
+        secrets: of the topics that are read, by epoch; messages of other epochs stay closed.
         from_ns: read records from the last checkpoint at or before this time on; 0: from the first.
         to_ns: read records up to this time, by the writer's clock.
 
@@ -53,17 +55,19 @@ class CapsuleReader:
         is_done: nothing is left to be read.
     """
 
-    def __init__(self, descriptor: Descriptor, secrets: Secrets, *, from_ns: int = 0, to_ns: int = _END_NS) -> None:
+    def __init__(
+        self, descriptor: Descriptor, secrets: Mapping[Name, Secrets], *, from_ns: int = 0, to_ns: int = _END_NS
+    ) -> None:
         self.descriptor = descriptor
         self._from_ns, self._to_ns = from_ns, to_ns
         self.audit = Audit(descriptor.name, descriptor.key)
-        self.opener = CapsuleOpener(descriptor.topic.name, descriptor.writer.name, secrets, descriptor.key)
+        self.opener = CapsuleOpener(descriptor, secrets)
         self._holes: list[tuple[Lost, int]] = []  # with the number of the checkpoint behind a gap, or 0
         self.is_done = False
         self._offset: int | None = None
         self._rest = b""
-        self._next: tuple[int, int] | None = None  # incarnation and sequence number of the next message
-        self._number = 0  # of the last record with a message
+        # by topic: incarnation and sequence number of the next message, and number of the last record with one
+        self._next: dict[Name, tuple[int, int, int]] = {}
 
     @property
     def lost(self) -> list[Lost]:
@@ -86,8 +90,8 @@ class CapsuleReader:
         if self._offset not in (None, answer.offset) and self._rest:
             self._rest = b""  # a record without its end, before a gap
             self.audit.skip()
-        if answer.described:
-            self._open(answer.described)
+        for wire in split(answer.described):
+            self._open(wire)
         self._offset = answer.offset + len(answer.data)
         data, at = self._rest + answer.data, 0
         while at + RECORD_MIN_BYTES <= len(data):
@@ -130,7 +134,8 @@ class CapsuleReader:
             return []
 
     def _count(self, kept: Kept, number: int) -> None:
-        if self._next is not None and self._next[0] == kept.incarnation and self._next[1] < kept.sequence:
-            behind = next((end for end in (*self.audit.gaps, *self.audit.left_out) if self._number < end < number), 0)
-            self._holes.append((Lost(kept.incarnation, self._next[1], kept.sequence - 1), behind))
-        self._next, self._number = (kept.incarnation, kept.sequence + 1), number
+        incarnation, sequence, before = self._next.get(kept.topic, (0, 0, 0))
+        if incarnation == kept.incarnation and sequence < kept.sequence:
+            behind = next((end for end in (*self.audit.gaps, *self.audit.left_out) if before < end < number), 0)
+            self._holes.append((Lost(kept.topic, incarnation, sequence, kept.sequence - 1), behind))
+        self._next[kept.topic] = kept.incarnation, kept.sequence + 1, number

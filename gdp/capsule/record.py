@@ -8,7 +8,7 @@ Sans-I/O. Wire form, big-endian::
             of a mark, its statement (``windows.py``) stands before the frames as one more
 
 The numbers of records rise by one. A bundle has the sequence number of its first message. Where nothing was published,
-``messages`` is 0.
+``messages`` is 0. In a capsule of several topics the frames name theirs; a mark has its name once for each.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 from gdp.errors import DropReason, RemoteError
+from gdp.frame.codec import decode
 
 RECORD_MAX_BYTES: Final = 48 << 20  # the largest message over the smallest link
 _HEAD: Final = struct.Struct("!IBQQQI")
@@ -89,9 +91,17 @@ class Record(NamedTuple):
         return frames
 
     @property
-    def sealed(self) -> list[bytes]:
-        """Return the frames that are sealed. Raises ``RemoteError``: MALFORMED."""
-        return self.frames[1 if self.type is RecordType.MARK else 0 :]
+    def sealed(self) -> list[list[bytes]]:
+        """Return the frames of each sealed message: one, but for a mark of several topics.
+
+        Raises:
+            RemoteError: MALFORMED.
+        """
+        frames = self.frames
+        if self.type is not RecordType.MARK:
+            return [frames]
+        begins = [at for at, frame in enumerate(frames) if at and decode(frame).part == 0]
+        return [frames[begin:end] for begin, end in pairwise([*begins, len(frames)])] if begins else [[]]
 
 
 def body_of(frames: Sequence[bytes]) -> bytes:

@@ -55,6 +55,7 @@ Folder = Annotated[Path, typer.Option("--store", metavar="FOLDER", help="Where t
 Which = Annotated[str, typer.Argument(metavar="NAME", help="The capsule: its first hex digits suffice.")]
 _DAMAGED = 1
 _REPLY_BYTES = 1_024
+_NAMES = ("topics", "writer")
 
 
 @app.command(
@@ -280,7 +281,7 @@ def _row(capsule: StoredCapsule) -> dict[str, object]:
     segments, descriptor = capsule.segments, capsule.descriptor
     return {
         "capsule": capsule.name.to_text(),
-        "topic": descriptor.topic.name.to_text(),
+        "topics": [each.to_text() for each in descriptor.topics],
         "writer": descriptor.writer.name.to_text(),
         "begun": _time(descriptor.begun_ms * 1_000_000),
         "bytes": segments.held_bytes,
@@ -304,6 +305,9 @@ def _print(row: Mapping[str, object], *, json: bool) -> None:
     if json:
         echo(json_text.dumps(row))
         return
-    names = ("topic", "writer")
-    shown = {key: Name.from_text(str(value)).short if key in names else value for key, value in row.items()}
-    echo("  ".join(f"{key} {value}" for key, value in shown.items()))
+    shown = [f"{key} {','.join(_short(value)) if key in _NAMES else value}" for key, value in row.items()]
+    echo("  ".join(shown))
+
+
+def _short(names: object) -> list[str]:
+    return [Name.from_text(str(each)).short for each in (names if isinstance(names, list) else [names])]

@@ -10,11 +10,12 @@ import logging
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from gdp.capsule.chain import CHECKPOINT_NS, ChainWriter
-from gdp.capsule.descriptor import Descriptor
+from gdp.capsule.descriptor import TOPICS_MAX, Descriptor, TopicRight
 from gdp.capsule.holder import HolderRequest
 from gdp.capsule.record import RecordType
 from gdp.capsule.upload import Uploader
@@ -25,7 +26,7 @@ from gdp.client.send_options import SendOptions
 from gdp.crypto.envelope import Sealed
 from gdp.crypto.identity import Identity
 from gdp.due_queue import earliest
-from gdp.errors import GdpError, StoreError
+from gdp.errors import GdpError, LocalError, StoreError
 from gdp.intervals import PACE_S, SCHEDULED_S, TICK_S
 from gdp.limits import WINDOW_BYTES
 from gdp.names import Name
@@ -43,10 +44,15 @@ _BACKGROUND: Final = SendOptions(priority="background")
 
 class _Waiting(NamedTuple):
     type: RecordType
-    frames: Sealed
-    sequence: int
-    messages: int
+    topic: Name | None  # None: a mark, in all topics
+    frames: tuple[Sealed, ...]
+    sequence: int = 0
+    messages: int = 0
     mark: Mark | None = None
+
+    @property
+    def size_bytes(self) -> int:
+        return sum(each.size_bytes for each in self.frames)
 
 
 def _asked(client: ClientCore, request: HolderRequest, now_s: float) -> Call:
@@ -57,7 +63,7 @@ def _asked(client: ClientCore, request: HolderRequest, now_s: float) -> Call:
 
 
 class _Upload:
-    """Upload of one topic's records to one holder.
+    """Upload of one capsule's records to one holder.
 
     Attributes:
         holder: name of its service.
@@ -106,8 +112,8 @@ class _Upload:
                 self.send_next(client, now_s, windows, is_chosen=is_chosen)
 
 
-class KeptTopic:
-    """One topic that is kept.
+class KeptCapsule:
+    """One capsule, of one topic or several.
 
     The records go to the holder that has most, and the others fetch them from it: the uplink carries them once.
 
@@ -115,20 +121,24 @@ class KeptTopic:
         around_ns: what is kept before and after each mark; None: everything is.
 
     Attributes:
+        publishers: of its topics, as far as they are kept now.
         ring: on the disk here.
+        is_superseded: another capsule has its topics now.
         lost: messages that the disk here did not take in time.
     """
 
     def __init__(
         self,
-        publisher: Publisher,
         ring: CapsuleRing,
         key: Identity,
         holders: Sequence[Name],
         around_ns: tuple[int, int] | None = None,
+        *,
+        is_superseded: bool = False,
     ) -> None:
-        self._publisher = publisher
+        self.publishers: dict[Name, Publisher] = {}
         self.ring = ring
+        self.is_superseded = is_superseded
         self.name = ring.descriptor.name
         self._writer = ChainWriter(ring.chain, key.key)
         self._uploads = [_Upload(ring, holder) for holder in holders]
@@ -138,10 +148,14 @@ class KeptTopic:
         self._marked: dict[str, int] = {}  # when each name was marked last
         self._waiting = deque[_Waiting]()
         self._waiting_bytes = 0
-        self._described: list[bytes] = []  # frames of the latest description in the ring
-        self._describes = False  # it is repeated before the next message
+        self._described: dict[Name, list[bytes]] = {}  # frames of each topic's latest description in the ring
+        self._describes: set[Name] = set()  # topics whose description is repeated before the next message
         self.lost = self._reported = 0
-        publisher.record(self._record, self._describe)
+
+    def add(self, topic: Name, publisher: Publisher) -> None:
+        """Keep what a publisher of one of the topics publishes from now on."""
+        self.publishers[topic] = publisher
+        publisher.record(partial(self._record, topic), partial(self._describe, topic))
 
     @property
     def uploader(self) -> Uploader:
@@ -160,18 +174,19 @@ class KeptTopic:
 
     def flush(self, time_ns: int) -> None:
         """Append what was sealed to the ring, with checkpoints where they are due."""
-        self._publisher.seal_recorded()
+        self._seal_recorded()
         pieces, windows = list[bytes](), self._windows
         while self.ring.is_ready and (self._waiting or self._is_due(time_ns)):
             if self._waiting and not self._writer.is_due(time_ns):
                 each = self._waiting.popleft()
-                frames = each.frames[:]
-                self._waiting_bytes -= each.frames.size_bytes
-                if each.type is RecordType.DESCRIPTION:
-                    self._described, self._describes = frames, False
-                elif self._describes and each.mark is None:
-                    pieces.append(self._writer.append(RecordType.DESCRIPTION, time_ns, self._described))
-                    self._describes = False
+                frames = [frame for sealed in each.frames for frame in sealed[:]]
+                self._waiting_bytes -= each.size_bytes
+                if each.topic is not None and each.type is RecordType.DESCRIPTION:
+                    self._described[each.topic] = frames
+                    self._describes.discard(each.topic)
+                elif each.topic in self._describes:
+                    pieces.append(self._writer.append(RecordType.DESCRIPTION, time_ns, self._described[each.topic]))
+                    self._describes.remove(each.topic)
                 elif each.mark is not None:
                     frames = [each.mark._replace(previous=self._mark).to_bytes(), *frames]
                     self._mark = self._writer.chain.number
@@ -186,8 +201,10 @@ class KeptTopic:
                     windows.close(self.ring.next)
                 windows.add_checkpoint(at)
                 self.ring.trim(windows.drop(min(self.confirmed)))
-            # what is before may be left out or dropped, and its description with it
-            self._describes = begins_file or windows is not None
+            if begins_file or windows is not None:
+                self._describes |= (
+                    self._described.keys()
+                )  # what is before may be left out or dropped, and these with it
         self._append(pieces)
 
     def _is_due(self, time_ns: int) -> bool:
@@ -203,12 +220,12 @@ class KeptTopic:
         if not self.ring.is_ready:
             raise StoreError(f"{name} is not marked: {self.ring.failure or 'the disk is too slow'}")
         mark = Mark(0, time_ns, time_ns, 0) if self._windows is None else self._windows.mark(time_ns)
-        recorder, last_ns = self._publisher.queue.recorder, self._marked.get(name)
-        if recorder is None or (last_ns is not None and time_ns - last_ns < CHECKPOINT_NS):
+        recorders, last_ns = [each.queue.recorder for each in self.publishers.values()], self._marked.get(name)
+        if last_ns is not None and time_ns - last_ns < CHECKPOINT_NS:
             return
         self._marked[name] = time_ns
-        self._waiting.append(_Waiting(RecordType.MARK, recorder.seal_mark(name, time_ns), 0, 0, mark))
-        self._waiting_bytes += self._waiting[-1].frames.size_bytes
+        sealed = tuple([each.seal_mark(name, time_ns) for each in recorders if each is not None])
+        self._wait(_Waiting(RecordType.MARK, None, sealed, mark=mark))
         self.flush(time_ns)
 
     def _append(self, pieces: list[bytes]) -> None:
@@ -233,7 +250,7 @@ class KeptTopic:
     @property
     def is_uploaded(self) -> bool:
         """Return whether every holder has confirmed all that was published; of windows, all that stands in one."""
-        self._publisher.seal_recorded()
+        self._seal_recorded()
         confirmed, end, windows = min(self.confirmed), self.ring.end, self._windows
         is_whole = confirmed == end if windows is None else windows.next(max(confirmed, self.ring.begin), end) is None
         return is_whole and not self.is_busy
@@ -254,21 +271,35 @@ class KeptTopic:
         return [*faults, f"{lost} messages are not kept: {why}"] if lost else faults
 
     def finish(self, time_ns: int) -> None:
-        """Append what was published so far, with a checkpoint over it; the publisher ends."""
+        """Append what was published so far, with a checkpoint over it; the publishers end."""
         self.flush(time_ns)
         if self._writer.has_new and self.ring.is_ready:
             self._append([self._writer.checkpoint(time_ns)])
 
-    def _record(self, frames: Sealed, sequence: int, messages: int) -> None:
+    def supersede(self, time_ns: int) -> None:
+        """Finish it, since another capsule has its topics now; without a message it stays as it is."""
+        self._seal_recorded()
+        if self.ring.next or any(each.type is RecordType.MESSAGE for each in self._waiting):
+            self.finish(time_ns)
+        self._waiting.clear()
+        self.is_superseded = True
+
+    def _seal_recorded(self) -> None:
+        for each in self.publishers.values():
+            each.seal_recorded()
+
+    def _record(self, topic: Name, frames: Sealed, sequence: int, messages: int) -> None:
         if self._waiting_bytes + frames.size_bytes > WINDOW_BYTES:
             self.lost += messages
             return
-        self._waiting_bytes += frames.size_bytes
-        self._waiting.append(_Waiting(RecordType.MESSAGE, frames, sequence, messages))
+        self._wait(_Waiting(RecordType.MESSAGE, topic, (frames,), sequence, messages))
 
-    def _describe(self, frames: Sealed, _sequence: int, _messages: int) -> None:
-        self._waiting_bytes += frames.size_bytes
-        self._waiting.append(_Waiting(RecordType.DESCRIPTION, frames, 0, 0))
+    def _describe(self, topic: Name, frames: Sealed, _sequence: int, _messages: int) -> None:
+        self._wait(_Waiting(RecordType.DESCRIPTION, topic, (frames,)))
+
+    def _wait(self, waiting: _Waiting) -> None:
+        self._waiting_bytes += waiting.size_bytes
+        self._waiting.append(waiting)
 
 
 class CapsuleKeeper:
@@ -280,8 +311,8 @@ class CapsuleKeeper:
         pool: one thread; None: of its own.
 
     Attributes:
-        topics: what is kept, by topic.
-        ended: what is kept no more and not yet uploaded, by topic.
+        topics: the capsule of each topic that is kept.
+        ended: capsules that are continued no more, and not yet uploaded, by name.
     """
 
     def __init__(
@@ -293,8 +324,9 @@ class CapsuleKeeper:
         self._start = start
         self._pool = ThreadPoolExecutor(1, "capsules") if pool is None else pool
         self._clients: dict[Name, ClientCore] = {}
-        self.topics: dict[Name, KeptTopic] = {}
-        self.ended: dict[Name, KeptTopic] = {}
+        self._by_folder: dict[Path, KeptCapsule] = {}
+        self.topics: dict[Name, KeptCapsule] = {}
+        self.ended: dict[Name, KeptCapsule] = {}
         self._due_s = 0.0
 
     def keep(
@@ -305,27 +337,64 @@ class CapsuleKeeper:
         most_bytes: int,
         unix_s: float,
         around_ns: tuple[int, int] | None = None,
-    ) -> KeptTopic:
+        capsule: str | None = None,
+    ) -> KeptCapsule:
         """Keep what a publisher publishes from now on.
 
         Args:
             holders: the delegations to call the holders' services, the preferred one first.
             most_bytes: of the ring.
-            around_ns: as of ``KeptTopic``.
+            around_ns: as of ``KeptCapsule``.
+            capsule: topics of one label share a capsule; None: it has one of its own. The first topic's values count.
 
         Raises:
-            GdpError: no delegation, or the folder cannot be read or written.
+            GdpError: no delegation, too many topics, or the folder cannot be read or written.
         """
-        delegation = topic.delegation
-        if (before := self.ended.pop(topic.name, None)) is not None:
-            before.ring.close()
-        descriptor = Descriptor(delegation.subject, self._identity.membership, delegation.chain, int(unix_s * 1e3))
-        ring = CapsuleRing(self._folder / topic.name.to_text(), descriptor, most_bytes, self._pool)
-        for holder in holders:
-            self._client(holder)
-        names = [holder.name for holder in holders]
-        kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, names, around_ns)
+        folder = self._folder / (capsule or topic.name.to_text())
+        kept = self._by_folder.get(folder)
+        if kept is None or topic.name not in kept.ring.descriptor.topics:
+            names = [holder.name for holder in holders]
+            kept = self._begin(folder, kept, topic, unix_s, most_bytes, names, around_ns)
+            for holder in holders:
+                self._client(holder)
+        kept.add(topic.name, publisher)
+        self.topics[topic.name] = kept
         log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
+        return kept
+
+    def _begin(
+        self,
+        folder: Path,
+        before: KeptCapsule | None,
+        topic: Topic,
+        unix_s: float,
+        most_bytes: int,
+        holders: Sequence[Name],
+        around_ns: tuple[int, int] | None,
+    ) -> KeptCapsule:
+        """Begin or continue the capsule in a folder that has a topic, and those of the one before."""
+        right, begun_ms = TopicRight(topic.delegation.subject, topic.delegation.chain), int(unix_s * 1e3)
+        rights = [right] if before is None else [*before.ring.descriptor.rights, right]
+        if len(rights) > TOPICS_MAX:
+            raise LocalError(f"keep: more than {TOPICS_MAX} topics in capsule {folder.name}; use several")
+        if before is not None:
+            begun_ms = max(begun_ms, before.ring.descriptor.begun_ms + 1)
+            before.supersede(int(unix_s * 1e9))
+            if before.ring.next:
+                self.ended[before.name] = before
+            else:
+                before.ring.remove()
+        descriptor = Descriptor.of_topics(rights, self._identity.membership, begun_ms)
+        for name, each in list(self.ended.items()):
+            if each.ring.continues(folder, descriptor):
+                self.ended.pop(name).ring.close()
+        ring = CapsuleRing(folder, descriptor, most_bytes, self._pool)
+        kept = self._by_folder[folder] = KeptCapsule(ring, self._identity, holders, around_ns)
+        for old in ring.older(self.ended):
+            self.ended[old.descriptor.name] = KeptCapsule(old, self._identity, holders, around_ns, is_superseded=True)
+        for name, publisher in {} if before is None else before.publishers.items():
+            kept.add(name, publisher)
+            self.topics[name] = kept
         return kept
 
     def ask(self, holder: Topic, request: HolderRequest, now_s: float) -> Call:
@@ -345,7 +414,10 @@ class CapsuleKeeper:
         kept = self.topics.pop(topic, None)
         if kept is not None:
             kept.finish(int(unix_s * 1e9))
-            self.ended[topic] = kept
+            del kept.publishers[topic]
+            if not kept.publishers:
+                del self._by_folder[kept.ring.folder]
+                self.ended[kept.name] = kept
 
     def is_asked(self, name: Name) -> bool:
         """Return whether a name is the service of a holder."""
@@ -361,33 +433,42 @@ class CapsuleKeeper:
             return  # nothing is kept yet, and no holder asked
         if now.mono_s >= self._due_s:
             self.flush(now.unix_s)
-            is_busy = bool(self.ended) or any(each.is_busy for each in self.topics.values())
+            is_busy = bool(self.ended) or any(each.is_busy for each in self.capsules)
             self._due_s = now.mono_s + (PACE_S if is_busy else TICK_S)
         for client in self._clients.values():
             due_s = client.get_timer()
             if due_s is not None and now.mono_s >= due_s:
                 client.handle_timer(now.mono_s)
-        for kept in (*self.topics.values(), *self.ended.values()):
+        for kept in self.capsules:
             kept.upload(self._clients, now.mono_s)
             if kept.is_reading:
                 self._due_s = min(self._due_s, now.mono_s + SCHEDULED_S)
         for name in [name for name, kept in self.ended.items() if kept.is_uploaded]:
-            self.ended.pop(name).ring.close()
+            kept = self.ended.pop(name)
+            if kept.is_superseded:
+                kept.ring.remove()
+            else:
+                kept.ring.close()
 
     def flush(self, unix_s: float) -> None:
         """Append what was published so far, for ``is_uploaded``."""
-        for kept in self.topics.values():
+        for kept in self._by_folder.values():
             kept.flush(int(unix_s * 1e9))
 
     @property
     def is_uploaded(self) -> bool:
         """Return whether the holders have confirmed all that was flushed."""
-        return all(each.is_uploaded for each in (*self.topics.values(), *self.ended.values()))
+        return all(each.is_uploaded for each in self.capsules)
 
     @property
     def confirmed(self) -> int:
         """Return how many bytes the holders have confirmed."""
-        return sum(sum(each.confirmed) for each in (*self.topics.values(), *self.ended.values()))
+        return sum(sum(each.confirmed) for each in self.capsules)
+
+    @property
+    def capsules(self) -> list[KeptCapsule]:
+        """Return those that are continued, and those that are not yet uploaded."""
+        return [*self._by_folder.values(), *self.ended.values()]
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""

@@ -54,7 +54,7 @@ class KeptTopics:
     def handle_timer(self, now_s: float) -> None:
         """Write and upload what is there."""
         self._keeper.handle(Timestamps(now_s, time.time()))
-        for kept in (*self._keeper.topics.values(), *self._keeper.ended.values()):
+        for kept in self._keeper.capsules:
             for fault in kept.poll_faults():
                 log.warning("history not kept capsule=%s reason=%s", kept.name.short, fault)
 

@@ -7,6 +7,8 @@ record. What was confirmed to no holder may be lost with the disk; then another 
 from __future__ import annotations
 
 import logging
+import shutil
+from collections.abc import Collection, Iterator
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -16,6 +18,7 @@ from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.record import Record, RecordType, find, size_of, split
 from gdp.capsule.windows import Mark, Place, Windows
 from gdp.errors import GdpError, RemoteError, StoreError
+from gdp.names import Name
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.segments import SEGMENT_BYTES, Segments
 
@@ -32,7 +35,7 @@ class CapsuleRing:
     """Ring of one capsule.
 
     Args:
-        folder: of the capsules of one topic; the newest is continued.
+        folder: of the capsules of the same topics; the newest that has all of the descriptor's is continued.
         descriptor: of a capsule that begins now.
         most_bytes: of all records here.
         pool: one thread.
@@ -40,6 +43,7 @@ class CapsuleRing:
     Attributes:
         chain: state after the records here, for the one that continues it.
         descriptor: of the capsule.
+        folder: as given.
         end: behind the last byte that is on the disk.
         begin: of the first byte here.
         next: offset of what is appended next.
@@ -53,6 +57,7 @@ class CapsuleRing:
     def __init__(self, folder: Path, descriptor: Descriptor, most_bytes: int, pool: Executor) -> None:
         self._pool = pool
         self._most_bytes = most_bytes
+        self.folder = folder
         self.segment_bytes = min(SEGMENT_BYTES, most_bytes // _PARTS)
         self.descriptor, self.chain, self._segments = _continued(folder, descriptor)
         self.begin, self.end = self._segments.begin, self._segments.end
@@ -113,6 +118,28 @@ class CapsuleRing:
                 at = end
         return windows
 
+    def continues(self, folder: Path, descriptor: Descriptor) -> bool:
+        """Return whether it is what a ring with these arguments would continue."""
+        return self.folder == folder and _has_all(self.descriptor, descriptor)
+
+    def older(self, known: Collection[Name]) -> Iterator[CapsuleRing]:
+        """Yield the rings of this writer's other capsules in the folder; what cannot be read is logged, and stays."""
+        for place in sorted(self.folder.iterdir()):
+            try:
+                descriptor = Descriptor.from_cbor(read_private(place / DESCRIPTOR))
+                if (
+                    descriptor.name not in (self.descriptor.name, *known)
+                    and descriptor.writer == self.descriptor.writer
+                ):
+                    yield CapsuleRing(self.folder, descriptor, self._most_bytes, self._pool)
+            except GdpError as error:
+                log.warning("capsule is not uploaded path=%s reason=%s", place, error)
+
+    def remove(self) -> None:
+        """Close it, and remove it from the disk."""
+        self.close()
+        shutil.rmtree(self._segments.folder)
+
     def close(self) -> None:
         """Put everything on the disk; returns when that is done."""
         self._pool.submit(self._segments.close).result()
@@ -140,22 +167,29 @@ class CapsuleRing:
 
 
 def _continued(folder: Path, descriptor: Descriptor) -> tuple[Descriptor, Chain, Segments]:
-    """Return the newest capsule in a folder, cut behind its last whole record, or a new one."""
+    """Return the newest capsule in a folder, cut behind its last whole record, or a new one; or the very one."""
+    place = folder / f"{descriptor.begun_ms:016x}"
+    if place.is_dir():
+        segments = Segments(place)
+        return descriptor, replayed(descriptor, segments)[0], segments
     known = sorted(folder.iterdir()) if folder.is_dir() else []
-    for place in reversed(known):
+    for each in reversed(known):
         try:
-            before = Descriptor.from_cbor(read_private(place / DESCRIPTOR))
-            if (before.topic, before.writer) != (descriptor.topic, descriptor.writer):
+            before = Descriptor.from_cbor(read_private(each / DESCRIPTOR))
+            if not _has_all(before, descriptor):
                 continue
-            segments = Segments(place)
+            segments = Segments(each)
             chain, _ = replayed(before, segments)
         except GdpError as error:
-            log.warning("capsule cannot be continued, another begins path=%s reason=%s", place, error)
+            log.warning("capsule cannot be continued, another begins path=%s reason=%s", each, error)
             continue
         return before, chain, segments
-    place = folder / f"{descriptor.begun_ms:016x}"
     write_all(place, {DESCRIPTOR: private(descriptor.to_cbor())})
     return descriptor, Chain(descriptor.name, descriptor.key), Segments(place)
+
+
+def _has_all(before: Descriptor, wanted: Descriptor) -> bool:
+    return before.writer == wanted.writer and {*before.topics} >= {*wanted.topics}
 
 
 def replayed(descriptor: Descriptor, segments: Segments) -> tuple[Chain, list[IndexedRecord]]:

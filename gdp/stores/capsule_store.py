@@ -30,6 +30,7 @@ from gdp.capsule.record import RECORD_MAX_BYTES, Record, RecordType, number_of, 
 from gdp.closing import ClosedOnExit
 from gdp.errors import GdpError, LocalError, RemoteError, StoreError
 from gdp.exchange.sync_set import HASH_BYTES, SyncSet
+from gdp.frame.codec import decode
 from gdp.intervals import MINUTE_S
 from gdp.names import ZERO, Name
 from gdp.stores.bucket import StoredObject
@@ -42,7 +43,6 @@ log = logging.getLogger(__name__)
 
 _RESTS_MAX_BYTES: Final = 4 * RECORD_MAX_BYTES
 _MARKS_MAX: Final = 1_024  # in one answer
-_PARTIES: Final = "topics' owner", "writer"
 _HEAD_BITS: Final = 24  # of the chain's head in a rank
 SPARE_BYTES: Final = 256 << 20  # of the disk, for what others write
 _BACKED_PARTS: Final = 8  # an open segment goes to a bucket again and again: it is smaller, and of less than this time
@@ -90,7 +90,7 @@ class StoredCapsule:
         rest: bytes of a record whose end has not come; in memory alone, and not confirmed.
         backed: behind the last byte that the bucket has; None: there is no bucket.
         file_ns: time of the first record of the last segment.
-        parties: key of the topic's owner, and name of the writer.
+        parties: keys of the topics' owners, and the writer's name.
         damage: why it takes no records; empty: it does.
     """
 
@@ -191,7 +191,7 @@ class CapsuleStore(ClosedOnExit):
         with self.lock:
             if request.ask is Ask.LIST:
                 found = [each.descriptor for each in self._capsules.values()]
-                of_topic = [each for each in found if request.topic in (ZERO, each.topic.name)]
+                of_topic = [each for each in found if request.topic in (ZERO, *each.topics)]
                 return HolderAnswer(descriptors=tuple(of_topic[:LISTED_MAX])).to_cbor()
             if request.ask is Ask.APPEND:
                 return self._append(request, client).to_cbor()
@@ -352,12 +352,7 @@ class CapsuleStore(ClosedOnExit):
         offset, data = segments.read(offset, BATCH_BYTES)
         described = b""
         if data and (request.time_ns or offset != request.offset):
-            with self.index.reading() as index:
-                row = index.execute(
-                    "SELECT wire FROM descriptions WHERE capsule = ? AND number < ? ORDER BY number DESC LIMIT 1",
-                    (capsule.name, number_of(data)),
-                ).fetchone()
-            described = b"" if row is None else row[0]
+            described = _described(self.index, capsule, number_of(data))
         return HolderAnswer(head=segments.end, offset=offset, data=data, described=described)
 
     def _compare(self, data: bytes) -> HolderAnswer:
@@ -444,22 +439,25 @@ class CapsuleStore(ClosedOnExit):
         write_all(place, {DESCRIPTOR: private(descriptor.to_cbor())}, force=True)
         capsule = self._capsules[descriptor.name] = StoredCapsule(place, self.limits.spare_bytes)
         capsule.backed = None if self.limits.cache_bytes is None else 0
-        log.info("capsule begun name=%s topic=%s", capsule.name.short, descriptor.topic.name.short)
+        log.info(
+            "capsule begun name=%s topics=%s", capsule.name.short, ",".join(each.short for each in descriptor.topics)
+        )
         return capsule
 
-    def _refuse_above_quota(self, parties: tuple[bytes, bytes], begun: StoredCapsule | None, more: int) -> None:
+    def _refuse_above_quota(self, parties: Sequence[bytes], begun: StoredCapsule | None, more: int) -> None:
         if sum(len(each.rest) for each in self._capsules.values()) > _RESTS_MAX_BYTES:
             raise StoreError("too many records are incomplete here; try again")
         most, cache_bytes = self.limits.owner_bytes, self.limits.cache_bytes
         if cache_bytes is not None and sum(each.pinned_bytes for each in self._capsules.values()) + more > cache_bytes:
             raise StoreError(f"the disk here has {cache_bytes} bytes for what the bucket lacks, and they are used")
-        for at, party in enumerate(parties):
-            found = [each for each in self._capsules.values() if each.parties[at] == party]
+        for party in parties:
+            found = [each for each in self._capsules.values() if party in each.parties]
             used = sum(max(each.segments.held_bytes, CHECKPOINT_BYTES) for each in found if each is not begun)
             held = 0 if begun is None else begun.segments.held_bytes
             if used + max(held + more, CHECKPOINT_BYTES) > most:
-                whose = f"the {_PARTIES[at]} has {used + held} bytes here, of {most}"
-                raise StoreError(f"{whose}: remove capsules, or raise the quota")
+                whose = "writer" if party == parties[-1] else "topics' owner"
+                detail = f"the {whose} has {used + held} bytes here, of {most}"
+                raise StoreError(f"{detail}: remove capsules, or raise the quota")
 
     def _retire(self, capsule: StoredCapsule) -> None:
         segments, limits = capsule.segments, self.limits
@@ -543,6 +541,19 @@ def _marks(index: TransactionFile, name: Name) -> list[bytes]:
     return [wire for wire, size in zip(found, sizes, strict=True) if size <= BATCH_BYTES][::-1]
 
 
+def _described(index: TransactionFile, capsule: StoredCapsule, number: int) -> bytes:
+    """Return the latest description of each topic before a record."""
+    found, topics = dict[bytes, bytes](), len(capsule.descriptor.topics)
+    query = "SELECT wire FROM descriptions WHERE capsule = ? AND number < ? ORDER BY number DESC"
+    with index.reading() as open_index:
+        for (wire,) in open_index.execute(query, (capsule.name, number)):
+            found.setdefault(decode(Record.from_wire(wire).frames[0]).destination, wire)
+            if len(found) == topics:
+                break
+    sizes = accumulate(map(len, found.values()))
+    return b"".join(wire for wire, size in zip(found.values(), sizes, strict=True) if size <= BATCH_BYTES)
+
+
 def index_of(folder: Path) -> TransactionFile:
     """Return the index of a store. Raises ``StoreError``: it cannot be opened."""
     return TransactionFile(folder / "index.db", _TABLE, synchronous="NORMAL")
@@ -554,8 +565,8 @@ def marks_of(folder: Path, name: Name) -> list[Record]:
         return [Record.from_wire(wire) for wire in _marks(index, name)]
 
 
-def _parties_of(descriptor: Descriptor) -> tuple[bytes, bytes]:
-    return descriptor.topic.owner_key, descriptor.writer.name
+def _parties_of(descriptor: Descriptor) -> Sequence[bytes]:
+    return [*dict.fromkeys(each.topic.owner_key for each in descriptor.rights), descriptor.writer.name]
 
 
 def _refuse_others(descriptor: Descriptor, client: Name) -> None:

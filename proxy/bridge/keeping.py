@@ -59,7 +59,7 @@ class TopicKeeper:
         self._member = member
         self._held = held
         self._local: dict[Name, str] = {}  # names of the topics that are kept
-        self._failing: set[Name] = set()
+        self._failing: set[Name] = set()  # capsules
         self._when: dict[str, set[Name]] = {}  # topics that each event marks
         self._fault_counts: dict[str, int] = {}
         self._was_attached = False
@@ -75,7 +75,7 @@ class TopicKeeper:
                     raise LocalError(f"keep: when: {event} is no event; expected a topic or {', '.join(_EVENTS)}")
                 self._when.setdefault(event, set()).add(topic.name)
             holders = [self._holder(each) for each in keep.to]
-            self.capsules.keep(topic, publisher, holders, keep.disk, unix_s, keep.around_ns)
+            self.capsules.keep(topic, publisher, holders, keep.disk, unix_s, keep.around_ns, keep.capsule)
         except GdpError as error:
             return str(error)
         return ""
@@ -94,7 +94,7 @@ class TopicKeeper:
 
     def _mark(self, name: str, topics: set[Name], unix_s: float) -> int:
         found = [kept for topic, kept in self.capsules.topics.items() if topic in topics]
-        for kept in found:
+        for kept in {each.name: each for each in found}.values():
             kept.mark(name, int(unix_s * 1e9))
         return len(found)
 
@@ -138,13 +138,16 @@ class TopicKeeper:
         self.capsules.handle(now)
         for joining in list(self._joins.values()):
             self._ask(joining, now.mono_s, faults)
-        for name, kept in (*self.capsules.topics.items(), *self.capsules.ended.items()):
+        for kept in self.capsules.capsules:
+            locals_ = [self._local[each] for each in kept.ring.descriptor.topics if each in self._local]
             for detail in kept.poll_faults():
-                self._failing.add(name)
-                faults.report(self._local[name], Fault.NOT_KEPT, detail)
-            if name in self._failing and not kept.uploader.is_refused and kept.is_uploaded:
-                self._failing.remove(name)
-                faults.clear(self._local[name], Fault.NOT_KEPT)
+                self._failing.add(kept.name)
+                for local in locals_:
+                    faults.report(local, Fault.NOT_KEPT, detail)
+            if kept.name in self._failing and not kept.uploader.is_refused and kept.is_uploaded:
+                self._failing.remove(kept.name)
+                for local in locals_:
+                    faults.clear(local, Fault.NOT_KEPT)
 
     def _find_events(self, faults: Faults) -> None:
         if not self._when:

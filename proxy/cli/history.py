@@ -27,7 +27,7 @@ from proxy.cli.replay import SkipEmpty, WaitReaders
 from proxy.cli.replay import replay as replay_recording
 from proxy.cli.tool_options import Node, print_json, print_text
 from proxy.endpoints.core.endpoint import Origin
-from proxy.node.history import PastMessage, TopicHistory, marks_of, merged
+from proxy.node.history import History, PastMessage, marks_of
 from proxy.recordings.folder_writer import write_folder
 from proxy.recordings.writer import BagWriter
 
@@ -107,35 +107,35 @@ def _export(
         is_marked = any(text is not None and text.startswith(_MARK) for text in span)
         marks = [mark for topic in topics for mark in marks_of(ask_holder, topic)] if is_marked else []
         from_ns, to_ns = _ns(span[0], 0, marks), _ns(span[1], _END_NS, marks, is_end=True)
-        histories = [
-            TopicHistory(ask_holder, topic, _name_of(topic, name), from_ns, to_ns)
-            for name, topic in zip(names, topics, strict=True)
-        ]
-        if not any(each.readers for each in histories):
+        titles = [_name_of(topic, name) for name, topic in zip(names, topics, strict=True)]
+        history = History(ask_holder, list(zip(topics, titles, strict=True)), from_ns, to_ns)
+        if not history.readers:
             raise LocalError(f"{holder} has no capsule of {', '.join(names)}")
-        count = _write(output, merged(histories))
+        count = _write(output, history.messages())
     is_whole = True
-    for history in histories:
-        for reader in history.readers:
-            findings = [each.words() for each in reader.audit.findings]
-            lost = [f"messages {each.first} to {each.last} are in no record" for each in reader.lost]
-            closed = [f"{number} records of epoch {epoch} are closed" for epoch, number in reader.opener.closed.items()]
-            unread = [f"{number} messages: {why}" for why, number in history.unreadable.items()]
-            problems = [*findings, *lost, *closed, *unread]
-            is_whole &= not problems
-            capsule = reader.descriptor.name.to_text()
-            about = {"topic": history.name, "capsule": capsule, "signer": reader.descriptor.writer.name.to_text()}
-            if json:
-                read = {
-                    "records": reader.audit.records,
-                    "left_out": sum(each.last - each.first + 1 for each in reader.left_out),
-                    "marks": [{"name": each.name, "at_ns": each.time_ns} for each in reader.opener.marks],
-                }
-                print_json({"event": "capsule", **about, **read, "problems": problems})
-            else:
-                print_text(f"{history.name}: {reader.audit.records} records, signed by {about['signer']}")
-                for line in [*(f"mark {each.name}" for each in reader.opener.marks), *problems]:
-                    print_text(f"  {line}")
+    for reader in history.readers:
+        of = {each: history.names[each] for each in reader.descriptor.topics if each in history.names}
+        findings = [each.words() for each in reader.audit.findings]
+        lost = [f"{of[each.topic]}: messages {each.first} to {each.last} are in no record" for each in reader.lost]
+        closed = [f"{number} records of epoch {epoch} are closed" for epoch, number in reader.opener.closed.items()]
+        unread = [
+            f"{of[each]}: {count} messages: {why}" for each in of for why, count in history.unreadable[each].items()
+        ]
+        problems = [*findings, *lost, *closed, *unread]
+        is_whole &= not problems
+        topic, capsule = ", ".join(of.values()), reader.descriptor.name.to_text()
+        about = {"topic": topic, "capsule": capsule, "signer": reader.descriptor.writer.name.to_text()}
+        if json:
+            read = {
+                "records": reader.audit.records,
+                "left_out": sum(each.last - each.first + 1 for each in reader.left_out),
+                "marks": [{"name": each.name, "at_ns": each.time_ns} for each in reader.opener.marks],
+            }
+            print_json({"event": "capsule", **about, **read, "problems": problems})
+        else:
+            print_text(f"{topic}: {reader.audit.records} records, signed by {about['signer']}")
+            for line in [*(f"mark {each.name}" for each in reader.opener.marks), *problems]:
+                print_text(f"  {line}")
     return is_whole, count
 
 

@@ -212,6 +212,10 @@ class ProxyConfig(Section):
                     yield (side, index, "history"), "under import this has a 'store', under expose none"
                 if rule.keep is not None and self.state is None:
                     yield (side, index, "keep"), "this needs 'state: FOLDER' of the file"
+                for at, other in enumerate(rules[:index]):
+                    key = "" if rule.keep is None or other.keep is None else rule.keep.disagreement(other.keep)
+                    if key:
+                        yield (side, index, "keep", key), f"{side}[{at}] states another one for the same capsule"
                 for event in () if rule.keep is None else rule.keep.when:
                     if event.startswith("/") and not self._is_topic(event):
                         yield (side, index, "keep", "when"), f"{event}: no rule of this file names such a topic"

@@ -55,6 +55,11 @@ class Keep(Section):
         BeforeValidator(read_size),
         WithJsonSchema({"anyOf": [{"type": "integer", "minimum": DISK_MIN_BYTES}, {"type": "string"}]}),
     ] = Field(default=10**9, ge=DISK_MIN_BYTES, description="Most bytes that wait here, such as `2GB`.")
+    capsule: str | None = Field(
+        default=None,
+        pattern=r"^[a-z][a-z0-9_-]{0,62}$",
+        description="Label: the topics of one label are kept together. Default: each by itself.",
+    )
     before: Span = Field(
         default=None, ge=0, le=HOUR_S, description="Time before an event, such as `60s`; only windows are uploaded."
     )
@@ -75,6 +80,13 @@ class Keep(Section):
         min_length=1,
         description="The holder's service, as `gdp delegate` named it, or 64 hex digits; or a list: each holds all.",
     )
+
+    def disagreement(self, other: Keep) -> str:
+        """Return the key that two rules of one capsule state differently, empty where there is none."""
+        if self.capsule is None or self.capsule != other.capsule:
+            return ""
+        keys = ("disk", "before", "after", "to")
+        return next((key for key in keys if getattr(self, key) != getattr(other, key)), "")
 
     @property
     def around_ns(self) -> tuple[int, int] | None:

@@ -19,7 +19,7 @@ from gdp.client.send_options import SendOptions
 from gdp.errors import GdpError, StoreError
 from gdp.names import Name
 from gdp.service.replication import Mode, Replication
-from gdp.session.keeping import CapsuleKeeper, KeptTopic
+from gdp.session.keeping import CapsuleKeeper, KeptCapsule
 from gdp.session.protocol.client_core import Call, ClientCore
 from gdp.session.protocol.server_core import ServerCore
 from gdp.stores.capsule_store import CapsuleStore, StoreLimits
@@ -168,8 +168,9 @@ class Keeping:
     most_bytes: int = 1 << 24
     holders: tuple[str, ...] = (STORE,)
     around_ns: tuple[int, int] | None = None
+    capsule: str | None = None
     keeper: CapsuleKeeper = field(init=False)
-    kept: KeptTopic = field(init=False)
+    kept: KeptCapsule = field(init=False)
     step_s: float = _STEP_S
     worked_s: float = 0.0
 
@@ -177,10 +178,20 @@ class Keeping:
         world, member = self.flow.world, self.flow.member
         identity = next(each for each in world.identities.values() if each.name == member.name)
         self.keeper = CapsuleKeeper(member, identity, self.folder, start=7, pool=Inline())
-        services = [world.topic(each, member, [Right.CALL], kind="service") for each in self.holders]
-        unix_s = world.network.now.unix_s
+        self.keep(self.flow)
+
+    def keep(self, flow: Flow) -> None:
+        """Keep the topic of a flow; the latest one's capsule is ``kept``."""
+        world = flow.world
+        services = [world.topic(each, flow.member, [Right.CALL], kind="service") for each in self.holders]
         self.kept = self.keeper.keep(
-            self.flow.topic, self.flow.publisher, services, self.most_bytes, unix_s, self.around_ns
+            flow.topic,
+            flow.publisher,
+            services,
+            self.most_bytes,
+            world.network.now.unix_s,
+            self.around_ns,
+            self.capsule,
         )
 
     def work(self) -> None:
@@ -237,7 +248,8 @@ def records_at(store: CapsuleStore, capsule: Name, *, time_ns: int = 0) -> bytes
 
 def read_from(holder: Holder, keeping: Keeping, from_ns: int = 0) -> tuple[list[Kept], CapsuleReader]:
     """Return what a reader with the topic's secrets gets from a holder, and the reader."""
-    reader = CapsuleReader(keeping.kept.ring.descriptor, keeping.flow.topic.secrets, from_ns=from_ns)
+    topic = keeping.flow.topic
+    reader = CapsuleReader(keeping.kept.ring.descriptor, {topic.name: topic.secrets}, from_ns=from_ns)
     kept = list[Kept]()
     while not reader.is_done:
         answer = holder.store.handle(reader.next_request().to_cbor(), Name(b"r" * 32))
@@ -248,5 +260,5 @@ def read_from(holder: Holder, keeping: Keeping, from_ns: int = 0) -> tuple[list[
 def opened(data: bytes, keeping: Keeping) -> list[Kept]:
     """Return the messages in records, opened with the secrets of the flow's topic."""
     descriptor, topic = keeping.kept.ring.descriptor, keeping.flow.topic
-    opener = CapsuleOpener(topic.name, descriptor.writer.name, topic.secrets, descriptor.key)
+    opener = CapsuleOpener(descriptor, {topic.name: topic.secrets})
     return [each for wire in split(data) for each in opener.open(Record.from_wire(wire))]

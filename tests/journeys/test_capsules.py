@@ -91,7 +91,7 @@ def test_nothing_is_readable_at_the_holder_before_a_grant(tmp_path: Path) -> Non
     assert {each.message for each in granted} == {text}
     assert {each.description for each in granted} == {b"described"}
     descriptor, topic = keeping.kept.ring.descriptor, keeping.flow.topic
-    opener = CapsuleOpener(topic.name, descriptor.writer.name, {}, descriptor.key)
+    opener = CapsuleOpener(descriptor, {topic.name: {}})
     data = records_at(holder.store, keeping.kept.name)
     assert not any(opener.open(Record.from_wire(wire)) for wire in split(data))
     assert sum(opener.closed.values()) > 0

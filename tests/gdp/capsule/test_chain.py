@@ -20,7 +20,7 @@ def test_the_records_of_a_writer_extend_the_chain() -> None:
     log, chain = Log().add(25).closed(), Chain(NAME, WRITER.public)
     for wire in log.wires:
         chain.handle_record(wire)
-    assert (chain.head, chain.number, chain.sequence) == (log.writer.chain.head, len(log.wires), 26)
+    assert (chain.head, chain.number) == (log.writer.chain.head, len(log.wires))
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 8, 13])

@@ -17,7 +17,8 @@ from gdp.capsule.reading import CapsuleReader, Lost
 FILE: dict[str, Any] = json.loads((Path(__file__).parents[2] / "vectors" / "capsule.json").read_text())
 WIRES = [bytes.fromhex(each["wire"]) for each in FILE["records"]]
 DESCRIPTOR = Descriptor.from_cbor(bytes.fromhex(FILE["descriptor"]["wire"]))
-SECRETS = {FILE["epoch"]: bytes.fromhex(FILE["secret"])}
+TOPIC = DESCRIPTOR.topic.name
+SECRETS = {TOPIC: {FILE["epoch"]: bytes.fromhex(FILE["secret"])}}
 MESSAGES = [bytes.fromhex(each["message"]) for each in FILE["opened"]]
 
 
@@ -43,7 +44,7 @@ def test_what_is_missing_or_damaged_is_named_and_the_rest_is_read() -> None:
     reader = CapsuleReader(DESCRIPTOR, SECRETS)
     kept = read(reader, b"".join([*WIRES[:3], *WIRES[4:]]))
     assert [each.message for each in kept] == [MESSAGES[0], MESSAGES[3]]
-    assert reader.lost == [Lost(FILE["incarnation"], 2, 3)]
+    assert reader.lost == [Lost(TOPIC, FILE["incarnation"], 2, 3)]
     assert [(each.damage, each.first) for each in reader.audit.findings] == [(Damage.REMOVED, 3)]
     flipped = bytearray(b"".join(WIRES))
     flipped[sum(map(len, WIRES[:3])) + 60] ^= 1
@@ -59,6 +60,6 @@ def test_a_span_of_time_is_read_alone() -> None:
 
 
 def test_without_the_epochs_secret_nothing_is_read() -> None:
-    reader = CapsuleReader(DESCRIPTOR, {})
+    reader = CapsuleReader(DESCRIPTOR, {TOPIC: {}})
     assert read(reader, b"".join(WIRES)) == []
     assert sum(reader.opener.closed.values()) == 4

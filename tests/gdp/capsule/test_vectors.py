@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from gdp.capsule.audit import Audit
 from gdp.capsule.chain import Chain
@@ -12,6 +15,7 @@ from gdp.capsule.checkpoint import Checkpoint
 from gdp.capsule.descriptor import Descriptor
 from gdp.capsule.opening import CapsuleOpener
 from gdp.capsule.record import Record, RecordType, leaf_of
+from gdp.errors import StatementError
 from gdp.names import Name
 
 FILE: dict[str, Any] = json.loads((Path(__file__).parents[2] / "vectors" / "capsule.json").read_text())
@@ -24,6 +28,17 @@ def test_the_name_digests_topic_writer_and_beginning() -> None:
     assert DESCRIPTOR.name.hex() == FILE["descriptor"]["name"]
     assert DESCRIPTOR.key.compressed.hex() == FILE["descriptor"]["writer_key"]
     assert DESCRIPTOR.to_cbor().hex() == FILE["descriptor"]["wire"]
+
+
+def test_a_name_of_several_topics_digests_their_names() -> None:
+    several = FILE["several"]
+    descriptor = Descriptor.from_cbor(bytes.fromhex(several["wire"]))
+    assert (descriptor.name.hex(), descriptor.to_cbor().hex()) == (several["name"], several["wire"])
+    assert [each.hex() for each in descriptor.topics] == several["topics"]
+    assert dict(descriptor.metadata) == several["metadata"]
+    assert several["metadata"]["topics"] == hashlib.sha256(b"".join(map(bytes.fromhex, several["topics"]))).hexdigest()
+    with pytest.raises(StatementError):
+        descriptor.check_right(descriptor.begun_ms / 1e3)
 
 
 def test_records_leaves_heads_and_roots_are_as_published() -> None:
@@ -43,11 +58,11 @@ def test_records_leaves_heads_and_roots_are_as_published() -> None:
 
 def test_the_epochs_secret_opens_it_and_another_epochs_opens_nothing() -> None:
     for epoch, opens in ((FILE["epoch"], True), (FILE["epoch"] + 1, False)):
-        secrets = {epoch: bytes.fromhex(FILE["secret"])}
-        opener = CapsuleOpener(DESCRIPTOR.topic.name, DESCRIPTOR.writer.name, secrets, DESCRIPTOR.key)
+        topic, secrets = DESCRIPTOR.topic.name, {epoch: bytes.fromhex(FILE["secret"])}
+        opener = CapsuleOpener(DESCRIPTOR, {topic: secrets})
         kept = [each for wire in WIRES for each in opener.open(Record.from_wire(wire))]
         assert [{"sequence": each.sequence, "message": each.message.hex()} for each in kept] == FILE["opened"] * opens
-        assert opener.description.hex() == FILE["description"] * opens
+        assert opener.descriptions.get(topic, b"").hex() == FILE["description"] * opens
         assert opener.closed == ({} if opens else {FILE["epoch"]: 4})
         assert {each.incarnation for each in kept} <= {FILE["incarnation"]}
     assert DESCRIPTOR.writer.name == Name.from_text(FILE["descriptor"]["writer"])

@@ -21,9 +21,12 @@ if TYPE_CHECKING:
 
 
 class Kept:
-    """A topic that is kept."""
+    """Capsule of a topic that is kept."""
 
-    def __init__(self) -> None:
+    name = Name(b"c" * 32)
+
+    def __init__(self, topic: Name) -> None:
+        self.ring = SimpleNamespace(descriptor=SimpleNamespace(topics=(topic,)))
         self.new: list[str] = []
         self.is_uploaded = True
         self.uploader = SimpleNamespace(is_refused=False)
@@ -37,15 +40,15 @@ def test_what_is_not_kept_is_a_fault_until_the_holder_has_all(tmp_path: Path) ->
     sites = Sites(tmp_path)
     member = sites.add("nuc1/robot").member
     identity = next(each for each in sites.world.identities.values() if each.name == member.name)
+    topic: Any = SimpleNamespace(name=Name(b"t" * 32))
     keeper, faults, kept = (
         TopicKeeper(member, identity, tmp_path, DelegationStore(tmp_path, identity)),
         Faults(),
-        Kept(),
+        Kept(topic.name),
     )
-    topic: Any = SimpleNamespace(name=Name(b"t" * 32))
     publisher: Any = None
     assert "0 delegations to call store" in keeper.keep("/scan", topic, publisher, Keep(to=("store",)), 1.0)
-    capsules = SimpleNamespace(topics={topic.name: kept}, ended={}, handle=lambda _now: None)
+    capsules = SimpleNamespace(capsules=[kept], handle=lambda _now: None)
     keeper.capsules = cast("CapsuleKeeper", capsules)
     kept.new, kept.uploader.is_refused = ["the quota is full"], True
     for _ in range(2):
@@ -65,10 +68,13 @@ def test_a_message_a_lost_uplink_and_a_fault_mark_the_topics_whose_rules_state_t
     topics = {Name(local.encode().ljust(32)): local for local in ("/scan", "/image")}
 
     def kept(local: str) -> Any:
-        return SimpleNamespace(mark=lambda name, _time_ns: marked.append((local, name)), poll_faults=list)
+        return SimpleNamespace(mark=lambda name, _time_ns: marked.append((local, name)), name=local)
 
     held: Any = SimpleNamespace(
-        topics={name: kept(local) for name, local in topics.items()}, ended={}, handle=lambda _now: None, keep=print
+        topics={name: kept(local) for name, local in topics.items()},
+        capsules=[],
+        handle=lambda _now: None,
+        keep=lambda *_: None,
     )
     keeper.capsules = held
     events = {"/scan": ("/estop", "uplink-lost", "too-fast"), "/image": ("/estop",)}

@@ -212,6 +212,21 @@ def test_a_topic_is_kept_by_one_holder_or_several(place: Path) -> None:
     assert "keep.to" in refusal(place, text.replace("[store-a, store-b]", "[]"))
 
 
+@pytest.mark.parametrize("key", ["disk: 2MB", "before: 5s", "after: 5s", "to: [other]"])
+def test_rules_of_one_capsule_agree_and_an_error_names_both(place: Path, key: str) -> None:
+    (place / "state").mkdir()
+    first, name = "{to: store, capsule: drive}", key.partition(":")[0]
+    second = f"{{{key}, capsule: drive}}" if name == "to" else f"{{to: store, {key}, capsule: drive}}"
+    texts = [f"name: /a, ros: 1, keep: {first}", f"name: /b, ros: 1, keep: {first}"]
+    good = f"{THREE}state: state\nexpose:\n{rules(*texts)}"
+    assert [rule.keep.capsule for rule in proxy(place, good).expose if rule.keep] == ["drive", "drive"]
+    said = refusal(place, f"{THREE}state: state\nexpose:\n{rules(texts[0], f'name: /b, ros: 1, keep: {second}')}")
+    assert f"keep.{name}" in said
+    assert "expose[0] states another one for the same capsule" in said
+    proxy(place, good.replace("capsule: drive}", "capsule: one}", 1).replace(first, second, 1))
+    assert "keep.capsule" in refusal(place, good.replace("drive", "A/B", 1))
+
+
 @pytest.mark.parametrize(("side", "history"), [("expose", "from-store"), ("import", "10")])
 def test_the_past_comes_from_a_store_to_importers_alone(place: Path, side: str, history: str) -> None:
     text = f"ros: {{endpoint: ros2, domain: 0}}\n{side}:\n{rules(f'name: /a, history: {history}')}"

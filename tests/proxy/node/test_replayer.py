@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from gdp.session.keeping import KeptTopic
+from gdp.session.keeping import KeptCapsule
 from proxy.bridge.sent_stats import SentStats
 from proxy.cli.replay import _report
 from proxy.node import node as proxy_node
@@ -121,8 +121,9 @@ def test_a_kept_topic_without_a_reader_is_confirmed_by_its_holders_if_nothing_is
     assert sites.run(3, lambda: bool(list(robot.member.publications)))
     node = ProxyNode.__new__(ProxyNode)  # without files and devices
     node.member, node.runtime = robot.member, cast(Any, Runtime(sites))
-    capsule = KeptTopic.__new__(KeptTopic)
-    capsule._publisher, capsule._windows, capsule._waiting, capsule.lost = robot.stream, None, deque(), lost
+    capsule = KeptCapsule.__new__(KeptCapsule)
+    capsule.publishers = {robot.stream.topic: robot.stream}
+    capsule._windows, capsule._waiting, capsule.lost = None, deque(), lost
     capsule.ring = cast(Any, SimpleNamespace(end=700, is_written=True))
     uploads = [
         SimpleNamespace(uploader=SimpleNamespace(confirmed=each, missing_bytes=missing_bytes), is_busy=False)
