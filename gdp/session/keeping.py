@@ -322,17 +322,14 @@ class CapsuleKeeper:
         descriptor = Descriptor(delegation.subject, self._identity.membership, delegation.chain, int(unix_s * 1e3))
         ring = CapsuleRing(self._folder / topic.name.to_text(), descriptor, most_bytes, self._pool)
         for holder in holders:
-            self._client(holder)
+            self.client(holder)
         names = [holder.name for holder in holders]
         kept = self.topics[topic.name] = KeptTopic(publisher, ring, self._identity, names, around_ns)
         log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
         return kept
 
-    def ask(self, holder: Topic, request: HolderRequest, now_s: float) -> Call:
-        """Ask a holder; the call ends later. Raises ``LocalError``: no delegation."""
-        return _asked(self._client(holder), request, now_s)
-
-    def _client(self, holder: Topic) -> ClientCore:
+    def client(self, holder: Topic) -> ClientCore:
+        """Return the client of a holder's service. Raises ``LocalError``: no delegation."""
         client = self._clients.get(holder.name)
         if client is None:
             label = f"holder {holder.name.short}"

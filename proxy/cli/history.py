@@ -16,12 +16,13 @@ from typing import Annotated
 
 import typer
 
+from gdp.capsule.holder import HolderAnswer, HolderRequest
 from gdp.capsule.opening import NamedMark
 from gdp.cli.node import Config, Json, Logs, MemberPlane, failing_clearly
-from gdp.cli.store import ask
 from gdp.client.participant import Topic
 from gdp.errors import LocalError
-from gdp.session.session import open_session
+from gdp.session.protocol.nearest_holder import NearestHolder
+from gdp.session.session import Session, open_session
 from gdp.trust.right import Right
 from proxy.cli.replay import SkipEmpty, WaitReaders
 from proxy.cli.replay import replay as replay_recording
@@ -36,7 +37,10 @@ _END_NS = (1 << 63) - 1
 _SECONDS = re.compile(r"\d+(\.\d+)?")
 
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Topics, as they were delegated, or hex digits.")]
-Store = Annotated[str, typer.Option("--holder", metavar="SERVICE", help="The holder's service.")]
+Store = Annotated[
+    list[str] | None,
+    typer.Option("--holder", metavar="SERVICE", help="A holder. Repeatable: the nearest is read. Default: store."),
+]
 From = Annotated[str | None, typer.Option("--from", metavar="TIME", help="RFC 3339, Unix seconds, or mark:NAME.")]
 To = Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same.")]
 Output = Annotated[
@@ -48,7 +52,7 @@ def export(
     names: Names,
     node: Node,
     output: Output,
-    holder: Store = "store",
+    holder: Store = None,
     from_: From = None,
     to: To = None,
     json: Json = False,
@@ -58,7 +62,7 @@ def export(
     Exit 1: something is damaged, missing, or closed without a grant of its epoch; it is named.
     """
     with failing_clearly():
-        is_whole, count = _export(names, node, holder, output, (from_, to), json=json)
+        is_whole, count = _export(names, node, holder or ["store"], output, (from_, to), json=json)
         if json:
             print_json({"event": "done", "file": str(output), "messages": count})
         else:
@@ -70,7 +74,7 @@ def replay(
     names: Names,
     node: Node,
     config: Config,
-    holder: Store = "store",
+    holder: Store = None,
     from_: From = None,
     to: To = None,
     rate: Annotated[float, typer.Option(min=0.0, help="1: as it was; 0: as fast as readers confirm.")] = 1.0,
@@ -88,7 +92,7 @@ def replay(
     with tempfile.TemporaryDirectory(prefix="gdp-history-") as folder:
         with failing_clearly():
             output = Path(folder) / "history.mcap"
-            is_whole, _ = _export(names, node, holder, output, (from_, to), json=json)
+            is_whole, _ = _export(names, node, holder or ["store"], output, (from_, to), json=json)
         try:
             replay_recording(
                 output, config, rate, skip_empty, wait_readers, data_plane=data_plane, json=json, logs=logs
@@ -98,11 +102,18 @@ def replay(
 
 
 def _export(
-    names: Sequence[str], node: Path, holder: str, output: Path, span: tuple[str | None, str | None], *, json: bool
+    names: Sequence[str],
+    node: Path,
+    holders: Sequence[str],
+    output: Path,
+    span: tuple[str | None, str | None],
+    *,
+    json: bool,
 ) -> tuple[bool, int]:
     """Write the recording, and report; return whether it has all, and how many messages it has."""
     with open_session(node) as session:
-        ask_holder = partial(ask, session, holder)
+        nearest = session.core.nearest_holder(holders)
+        ask_holder = partial(_ask, session, nearest)
         topics = [session.core.resolve(name, Right.READ) for name in names]
         is_marked = any(text is not None and text.startswith(_MARK) for text in span)
         marks = [mark for topic in topics for mark in marks_of(ask_holder, topic)] if is_marked else []
@@ -112,7 +123,7 @@ def _export(
             for name, topic in zip(names, topics, strict=True)
         ]
         if not any(each.readers for each in histories):
-            raise LocalError(f"{holder} has no capsule of {', '.join(names)}")
+            raise LocalError(f"{', '.join(holders)}: no capsule of {', '.join(names)}")
         count = _write(output, merged(histories))
     is_whole = True
     for history in histories:
@@ -136,7 +147,17 @@ def _export(
                 print_text(f"{history.name}: {reader.audit.records} records, signed by {about['signer']}")
                 for line in [*(f"mark {each.name}" for each in reader.opener.marks), *problems]:
                     print_text(f"  {line}")
+    for choice in nearest.choices:
+        print_json({"event": "holder", **choice._asdict()}) if json else print_text(choice.words())
     return is_whole, count
+
+
+def _ask(session: Session, holder: NearestHolder, request: HolderRequest) -> HolderAnswer:
+    """Return the answer of the nearest holder. Raises ``GdpError``: there is none."""
+    driver = session.driver
+    driver.run(lambda: holder.begin(request, driver.now_s()))
+    driver.wait(lambda: holder.is_done, None)
+    return driver.run(holder.poll_answer) or HolderAnswer()
 
 
 def _write(output: Path, messages: Iterator[PastMessage]) -> int:
