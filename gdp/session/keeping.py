@@ -135,7 +135,7 @@ class KeptTopic:
         self._chosen = self._uploads[0]
         self._windows = None if around_ns is None else ring.windows(*around_ns)
         self._mark = ring.mark  # number of the record of the last one
-        self._marked: dict[str, int] = {}  # when each name was marked last
+        self._marked: dict[str, int] = {}  # when each name was marked last, within a second
         self._waiting = deque[_Waiting]()
         self._waiting_bytes = 0
         self._described: list[bytes] = []  # frames of the latest description in the ring
@@ -206,6 +206,7 @@ class KeptTopic:
         recorder, last_ns = self._publisher.queue.recorder, self._marked.get(name)
         if recorder is None or (last_ns is not None and time_ns - last_ns < CHECKPOINT_NS):
             return
+        self._marked = {each: at_ns for each, at_ns in self._marked.items() if time_ns - at_ns < CHECKPOINT_NS}
         self._marked[name] = time_ns
         self._waiting.append(_Waiting(RecordType.MARK, recorder.seal_mark(name, time_ns), 0, 0, mark))
         self._waiting_bytes += self._waiting[-1].frames.size_bytes

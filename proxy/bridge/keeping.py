@@ -87,11 +87,15 @@ class TopicKeeper:
         """Mark an event in all topics that are kept; return how many. Raises ``StoreError``: a disk refuses."""
         return self._mark(name, set(self.capsules.topics), unix_s)
 
-    def handle_event(self, event: str, faults: Faults) -> None:
-        """Mark an event in the topics whose rule states it: a message of a local topic, or another one."""
+    def handle_event(self, event: str, faults: Faults, which: str = "") -> None:
+        """Mark an event in the topics whose rule states it: a message of a local topic, a call, or another one.
+
+        Args:
+            which: a call: the client of a service, or the id of a goal.
+        """
         if event in self._when:
             try:
-                self._mark(event, self._when[event], time.time())
+                self._mark(f"{event} {which}".rstrip(), self._when[event], time.time())
             except StoreError as error:
                 faults.report(event, Fault.NOT_KEPT, str(error))
 

@@ -18,7 +18,8 @@ import typer
 
 from gdp.capsule.holder import HolderAnswer, HolderRequest
 from gdp.capsule.opening import NamedMark
-from gdp.cli.node import Config, Json, Logs, MemberPlane, failing_clearly
+from gdp.capsule.windows import Mark
+from gdp.cli.node import Config, Json, Logs, MemberPlane, failing_clearly, report
 from gdp.client.participant import Topic
 from gdp.errors import LocalError
 from gdp.session.protocol.nearest_holder import NearestHolder
@@ -55,14 +56,19 @@ def export(
     holder: Store = None,
     from_: From = None,
     to: To = None,
+    mark: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Each window of this event is a recording: FILE-1, FILE-2, ...")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Write what a holder has of topics as one recording, in the order of their stamps.
 
+    The mark of a call has the client after its name, that of a goal the goal's id: 'mark:/drive/goal' is the last goal.
+
     Exit 1: something is damaged, missing, or closed without a grant of its epoch; it is named.
     """
     with failing_clearly():
-        is_whole, count = _export(names, node, holder or ["store"], output, (from_, to), json=json)
+        is_whole, count = _export(names, node, holder or ["store"], output, (from_, to), mark, json=json)
         if json:
             print_json({"event": "done", "file": str(output), "messages": count})
         else:
@@ -107,49 +113,66 @@ def _export(
     holders: Sequence[str],
     output: Path,
     span: tuple[str | None, str | None],
+    mark: str | None = None,
     *,
     json: bool,
 ) -> tuple[bool, int]:
-    """Write the recording, and report; return whether it has all, and how many messages it has."""
+    """Write the recordings, and report; return whether they have all, and how many messages they have."""
+    if mark is not None and any(span):
+        raise LocalError("--mark states both ends of each recording; leave out --from and --to")
+    is_whole, count = True, 0
     with open_session(node) as session:
         nearest = session.core.nearest_holder(holders)
         ask_holder = partial(_ask, session, nearest)
         topics = [session.core.resolve(name, Right.READ) for name in names]
-        is_marked = any(text is not None and text.startswith(_MARK) for text in span)
+        is_marked = mark is not None or any(text is not None and text.startswith(_MARK) for text in span)
         marks = [mark for topic in topics for mark in marks_of(ask_holder, topic)] if is_marked else []
-        from_ns, to_ns = _ns(span[0], 0, marks), _ns(span[1], _END_NS, marks, is_end=True)
-        histories = [
-            TopicHistory(ask_holder, topic, _name_of(topic, name), from_ns, to_ns)
-            for name, topic in zip(names, topics, strict=True)
-        ]
-        if not any(each.readers for each in histories):
-            raise LocalError(f"{', '.join(holders)}: no capsule of {', '.join(names)}")
-        count = _write(output, merged(histories))
-    is_whole = True
-    for history in histories:
-        for reader in history.readers:
-            findings = [each.words() for each in reader.audit.findings]
-            lost = [f"messages {each.first} to {each.last} are in no record" for each in reader.lost]
-            closed = [f"{number} records of epoch {epoch} are closed" for epoch, number in reader.opener.closed.items()]
-            unread = [f"{number} messages: {why}" for why, number in history.unreadable.items()]
-            problems = [*findings, *lost, *closed, *unread]
-            is_whole &= not problems
-            capsule = reader.descriptor.name.to_text()
-            about = {"topic": history.name, "capsule": capsule, "signer": reader.descriptor.writer.name.to_text()}
-            if json:
-                read = {
-                    "records": reader.audit.records,
-                    "left_out": sum(each.last - each.first + 1 for each in reader.left_out),
-                    "marks": [{"name": each.name, "at_ns": each.time_ns} for each in reader.opener.marks],
-                }
-                print_json({"event": "capsule", **about, **read, "problems": problems})
-            else:
-                print_text(f"{history.name}: {reader.audit.records} records, signed by {about['signer']}")
-                for line in [*(f"mark {each.name}" for each in reader.opener.marks), *problems]:
-                    print_text(f"  {line}")
+        spans = {output: (_ns(span[0], 0, marks), _ns(span[1], _END_NS, marks, is_end=True))}
+        if mark is not None:
+            windows = enumerate(_windows(mark, marks), 1)
+            spans = {output.with_stem(f"{output.stem}-{at}"): (each.from_ns, each.to_ns) for at, each in windows}
+        for file, (from_ns, to_ns) in spans.items():
+            histories = [
+                TopicHistory(ask_holder, topic, _name_of(topic, name), from_ns, to_ns)
+                for name, topic in zip(names, topics, strict=True)
+            ]
+            if not any(each.readers for each in histories):
+                raise LocalError(f"{', '.join(holders)}: no capsule of {', '.join(names)}")
+            written = _write(file, merged(histories))
+            count += written
+            for each in histories:
+                is_whole &= _report(each, json=json)
+            if mark is not None:
+                report("window", f"{written} messages are in {file}", json=json, file=str(file), messages=written)
     for choice in nearest.choices:
         print_json({"event": "holder", **choice._asdict()}) if json else print_text(choice.words())
     return is_whole, count
+
+
+def _report(history: TopicHistory, *, json: bool) -> bool:
+    """Report what was read of a topic; return whether that is all."""
+    is_whole = True
+    for reader in history.readers:
+        findings = [each.words() for each in reader.audit.findings]
+        lost = [f"messages {each.first} to {each.last} are in no record" for each in reader.lost]
+        closed = [f"{number} records of epoch {epoch} are closed" for epoch, number in reader.opener.closed.items()]
+        unread = [f"{number} messages: {why}" for why, number in history.unreadable.items()]
+        problems = [*findings, *lost, *closed, *unread]
+        is_whole &= not problems
+        capsule = reader.descriptor.name.to_text()
+        about = {"topic": history.name, "capsule": capsule, "signer": reader.descriptor.writer.name.to_text()}
+        if json:
+            read = {
+                "records": reader.audit.records,
+                "left_out": sum(each.last - each.first + 1 for each in reader.left_out),
+                "marks": [{"name": each.name, "at_ns": each.time_ns} for each in reader.opener.marks],
+            }
+            print_json({"event": "capsule", **about, **read, "problems": problems})
+        else:
+            print_text(f"{history.name}: {reader.audit.records} records, signed by {about['signer']}")
+            for line in [*(f"mark {each.name}" for each in reader.opener.marks), *problems]:
+                print_text(f"  {line}")
+    return is_whole
 
 
 def _ask(session: Session, holder: NearestHolder, request: HolderRequest) -> HolderAnswer:
@@ -177,15 +200,21 @@ def _name_of(topic: Topic, name: str) -> str:
     return name if metadata is None else str(metadata.get("name", name))
 
 
+def _windows(name: str, marks: Sequence[NamedMark]) -> list[Mark]:
+    """Return the windows of the marks whose first words these are. Raises ``LocalError``: there is none."""
+    found = {each.time_ns: each.window for each in sorted(marks) if f"{each.name} ".startswith(f"{name} ")}
+    if not found:
+        raise LocalError(f"mark {name}: known marks: {', '.join(sorted({each.name for each in marks})) or 'none'}")
+    return list(found.values())
+
+
 def _ns(text: str | None, otherwise: int, marks: Sequence[NamedMark], *, is_end: bool = False) -> int:
     """Return a time in Unix nanoseconds; of a mark, where its window begins or ends. Raises ``LocalError``: none."""
     if text is None:
         return otherwise
     if text.startswith(_MARK):
-        windows = [each.window for each in sorted(marks) if each.name == text.removeprefix(_MARK)]
-        if not windows:
-            raise LocalError(f"{text}: known marks: {', '.join(sorted({each.name for each in marks})) or 'none'}")
-        return windows[-1].to_ns if is_end else windows[-1].from_ns
+        last = _windows(text.removeprefix(_MARK), marks)[-1]
+        return last.to_ns if is_end else last.from_ns
     if _SECONDS.fullmatch(text):
         return int(float(text) * 1e9)
     try:

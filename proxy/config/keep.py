@@ -66,7 +66,8 @@ class Keep(Section):
         WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}),
     ] = Field(
         default=(),
-        description="Events: a message of a topic that a rule names (`/estop`), `uplink-lost`, or a fault's word.",
+        description="Events: a message of a topic (`/estop`), a call of an exposed service (`/dock`), a goal or result"
+        " of an exposed action (`/drive/goal`, `/drive/result`), `uplink-lost`, or a fault's word.",
     )
     to: Annotated[
         tuple[Annotated[str, Field(min_length=1)], ...],
