@@ -35,3 +35,4 @@ class Replication:
 
 
 ALL: Final = Replication()
+NEAREST: Final = Replication(Mode.NEAREST)

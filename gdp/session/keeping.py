@@ -145,7 +145,7 @@ class KeptCapsule:
         self._chosen = self._uploads[0]
         self._windows = None if around_ns is None else ring.windows(*around_ns)
         self._mark = ring.mark  # number of the record of the last one
-        self._marked: dict[str, int] = {}  # when each name was marked last
+        self._marked: dict[str, int] = {}  # when each name was marked last, within a second
         self._waiting = deque[_Waiting]()
         self._waiting_bytes = 0
         self._described: dict[Name, list[bytes]] = {}  # frames of each topic's latest description in the ring
@@ -223,6 +223,7 @@ class KeptCapsule:
         recorders, last_ns = [each.queue.recorder for each in self.publishers.values()], self._marked.get(name)
         if last_ns is not None and time_ns - last_ns < CHECKPOINT_NS:
             return
+        self._marked = {each: at_ns for each, at_ns in self._marked.items() if time_ns - at_ns < CHECKPOINT_NS}
         self._marked[name] = time_ns
         sealed = tuple([each.seal_mark(name, time_ns) for each in recorders if each is not None])
         self._wait(_Waiting(RecordType.MARK, None, sealed, mark=mark))
@@ -356,7 +357,7 @@ class CapsuleKeeper:
             names = [holder.name for holder in holders]
             kept = self._begin(folder, kept, topic, unix_s, most_bytes, names, around_ns)
             for holder in holders:
-                self._client(holder)
+                self.client(holder)
         kept.add(topic.name, publisher)
         self.topics[topic.name] = kept
         log.info("topic kept name=%s capsule=%s", topic.name.short, kept.name.short)
@@ -397,11 +398,8 @@ class CapsuleKeeper:
             self.topics[name] = kept
         return kept
 
-    def ask(self, holder: Topic, request: HolderRequest, now_s: float) -> Call:
-        """Ask a holder; the call ends later. Raises ``LocalError``: no delegation."""
-        return _asked(self._client(holder), request, now_s)
-
-    def _client(self, holder: Topic) -> ClientCore:
+    def client(self, holder: Topic) -> ClientCore:
+        """Return the client of a holder's service. Raises ``LocalError``: no delegation."""
         client = self._clients.get(holder.name)
         if client is None:
             label = f"holder {holder.name.short}"

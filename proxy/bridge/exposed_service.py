@@ -260,6 +260,7 @@ class ExposedService(ServiceFlow):
             )
             if self._kept is not None:
                 self._kept.entry(asked.client, asked.call, raw, now_s)
+                self._note_event("", asked.client.short)
             else:
                 self._begin(now_s, self._patience_s(request), asked, raw)
         except DefinitionError as error:
@@ -314,8 +315,17 @@ class ExposedService(ServiceFlow):
         call, what = self.dispatcher.endpoint.call, self.flow_spec.local
         for turn in self._serving.poll_turns(now_s):
             given = self._servers[turn.asked.part], turn.number, turn.request
+            if self.flow_spec.rule.kind == "service":
+                self._note_event("", turn.asked.client.short)
+            elif turn.asked.part == GOAL:
+                self._note_event("/goal", goal_of(turn.request).hex())
             if not self.context.contain(what, turn.asked.client, now_s, call, *given):
                 self._end_call(turn.number, "the request could not be passed on")
+
+    def _note_event(self, part: str, which: str) -> None:
+        """Begin windows around a call, or the end of a goal, in the topics whose rules state it."""
+        if self.context.keeper is not None:
+            self.context.keeper.handle_event(self.flow_spec.local + part, self.context.faults, which)
 
     def _end_call(self, number: int, ending: str | bytes) -> None:
         """Send the response of a call that has ended, or the reason why there is none."""
@@ -323,8 +333,10 @@ class ExposedService(ServiceFlow):
         for asked in ended:
             if asked is None:
                 continue
-            self._goals.end(asked)
+            goal = self._goals.end(asked)
             if isinstance(ending, bytes):
+                if asked.part == RESULT and goal is not None:
+                    self._note_event("/result", goal.hex())
                 self._responses.respond(asked, ending)
             else:
                 self._responses.fail(asked, Fault.REFUSED, ending)

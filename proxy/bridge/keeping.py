@@ -5,6 +5,7 @@ I/O, by its rings.
 
 from __future__ import annotations
 
+import logging
 import secrets
 import time
 from collections.abc import Callable
@@ -12,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gdp.capsule.holder import HolderAnswer
 from gdp.capsule.late_join import LateJoin
 from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
@@ -24,11 +24,13 @@ from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.sansio import Timestamps
 from gdp.session.keeping import CapsuleKeeper
-from gdp.session.protocol.client_core import Call
+from gdp.session.protocol.nearest_holder import NearestHolder
 from gdp.trust.right import Right
 from proxy.bridge.faults import Fault, Faults
 from proxy.config.history import History
 from proxy.config.keep import UPLINK_LOST, Keep
+
+log = logging.getLogger(__name__)
 
 _FAULTS: Final = {each.value: None for each in Fault if each is not Fault.NOT_KEPT}
 _EVENTS: Final = (UPLINK_LOST, *_FAULTS)
@@ -38,9 +40,10 @@ _EVENTS: Final = (UPLINK_LOST, *_FAULTS)
 class _Joining:
     local: str
     join: LateJoin
-    store: str
+    stores: tuple[str, ...]
     deliver: Callable[[float], None]
-    call: Call | None = None
+    holder: NearestHolder | None = None
+    choices: int = 0  # that were logged
     due_s: float = 0.0
 
 
@@ -84,11 +87,15 @@ class TopicKeeper:
         """Mark an event in all topics that are kept; return how many. Raises ``StoreError``: a disk refuses."""
         return self._mark(name, set(self.capsules.topics), unix_s)
 
-    def handle_event(self, event: str, faults: Faults) -> None:
-        """Mark an event in the topics whose rule states it: a message of a local topic, or another one."""
+    def handle_event(self, event: str, faults: Faults, which: str = "") -> None:
+        """Mark an event in the topics whose rule states it: a message of a local topic, a call, or another one.
+
+        Args:
+            which: a call: the client of a service, or the id of a goal.
+        """
         if event in self._when:
             try:
-                self._mark(event, self._when[event], time.time())
+                self._mark(f"{event} {which}".rstrip(), self._when[event], time.time())
             except StoreError as error:
                 faults.report(event, Fault.NOT_KEPT, str(error))
 
@@ -99,9 +106,9 @@ class TopicKeeper:
         return len(found)
 
     def join(self, local: str, topic: Topic, history: History, deliver: Callable[[float], None]) -> LateJoin:
-        """Return a topic's past from a holder, for a reader that joins late; ``deliver`` is called when it has come."""
+        """Return a topic's past from the nearest holder, for a late reader; ``deliver`` is called when it has come."""
         join = LateJoin(topic, time.time(), history.age_s, history.messages, history.max_bytes)
-        self._joins[topic.name] = _Joining(local, join, history.store or "", deliver)
+        self._joins[topic.name] = _Joining(local, join, history.store or (), deliver)
         return join
 
     def leave(self, topic: Name) -> None:
@@ -110,18 +117,22 @@ class TopicKeeper:
 
     def _ask(self, joining: _Joining, now_s: float, faults: Faults) -> None:
         """Ask a holder for the next part of a topic's past."""
-        join, call, joining.due_s = joining.join, joining.call, now_s + PACE_S
+        join, holder, joining.due_s = joining.join, joining.holder, now_s + PACE_S
         try:
-            if call is not None and call.is_done:
-                joining.call = None
-                if call.response is None:
-                    raise call.error or LocalError("no answer")
-                join.handle_response(HolderAnswer.from_cbor(call.response.payload), now_s)
-            if joining.call is None and (request := join.next_request(now_s)) is not None:
-                joining.call = self.capsules.ask(self._holder(joining.store), request, now_s)
+            if holder is None:
+                clients = {each: self.capsules.client(self._holder(each)) for each in joining.stores}
+                holder = joining.holder = NearestHolder(clients)
+            holder.handle_timer(now_s)
+            if (answer := holder.poll_answer()) is not None:
+                join.handle_response(answer, now_s)
+            if len(holder.choices) > joining.choices:
+                joining.choices = len(holder.choices)
+                log.info("past of %s is %s", joining.local, holder.choices[-1].words())
+            if holder.is_idle and (request := join.next_request(now_s)) is not None:
+                holder.begin(request, now_s)
         except GdpError as error:
             join.give_up()
-            faults.report(joining.local, Fault.NOT_KEPT, f"no past from {joining.store}: {error}")
+            faults.report(joining.local, Fault.NOT_KEPT, f"no past from {', '.join(joining.stores)}: {error}")
         joining.deliver(now_s)
 
     def release(self, topic: Name, unix_s: float) -> None:

@@ -16,12 +16,14 @@ from typing import Annotated
 
 import typer
 
+from gdp.capsule.holder import HolderAnswer, HolderRequest
 from gdp.capsule.opening import NamedMark
-from gdp.cli.node import Config, Json, Logs, MemberPlane, failing_clearly
-from gdp.cli.store import ask
+from gdp.capsule.windows import Mark
+from gdp.cli.node import Config, Json, Logs, MemberPlane, failing_clearly, report
 from gdp.client.participant import Topic
 from gdp.errors import LocalError
-from gdp.session.session import open_session
+from gdp.session.protocol.nearest_holder import NearestHolder
+from gdp.session.session import Session, open_session
 from gdp.trust.right import Right
 from proxy.cli.replay import SkipEmpty, WaitReaders
 from proxy.cli.replay import replay as replay_recording
@@ -36,7 +38,10 @@ _END_NS = (1 << 63) - 1
 _SECONDS = re.compile(r"\d+(\.\d+)?")
 
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Topics, as they were delegated, or hex digits.")]
-Store = Annotated[str, typer.Option("--holder", metavar="SERVICE", help="The holder's service.")]
+Store = Annotated[
+    list[str] | None,
+    typer.Option("--holder", metavar="SERVICE", help="A holder. Repeatable: the nearest is read. Default: store."),
+]
 From = Annotated[str | None, typer.Option("--from", metavar="TIME", help="RFC 3339, Unix seconds, or mark:NAME.")]
 To = Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same.")]
 Output = Annotated[
@@ -48,17 +53,22 @@ def export(
     names: Names,
     node: Node,
     output: Output,
-    holder: Store = "store",
+    holder: Store = None,
     from_: From = None,
     to: To = None,
+    mark: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Each window of this event is a recording: FILE-1, FILE-2, ...")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Write what a holder has of topics as one recording, in the order of their stamps.
 
+    The mark of a call has the client after its name, that of a goal the goal's id: 'mark:/drive/goal' is the last goal.
+
     Exit 1: something is damaged, missing, or closed without a grant of its epoch; it is named.
     """
     with failing_clearly():
-        is_whole, count = _export(names, node, holder, output, (from_, to), json=json)
+        is_whole, count = _export(names, node, holder or ["store"], output, (from_, to), mark, json=json)
         if json:
             print_json({"event": "done", "file": str(output), "messages": count})
         else:
@@ -70,7 +80,7 @@ def replay(
     names: Names,
     node: Node,
     config: Config,
-    holder: Store = "store",
+    holder: Store = None,
     from_: From = None,
     to: To = None,
     rate: Annotated[float, typer.Option(min=0.0, help="1: as it was; 0: as fast as readers confirm.")] = 1.0,
@@ -88,7 +98,7 @@ def replay(
     with tempfile.TemporaryDirectory(prefix="gdp-history-") as folder:
         with failing_clearly():
             output = Path(folder) / "history.mcap"
-            is_whole, _ = _export(names, node, holder, output, (from_, to), json=json)
+            is_whole, _ = _export(names, node, holder or ["store"], output, (from_, to), json=json)
         try:
             replay_recording(
                 output, config, rate, skip_empty, wait_readers, data_plane=data_plane, json=json, logs=logs
@@ -98,20 +108,46 @@ def replay(
 
 
 def _export(
-    names: Sequence[str], node: Path, holder: str, output: Path, span: tuple[str | None, str | None], *, json: bool
+    names: Sequence[str],
+    node: Path,
+    holders: Sequence[str],
+    output: Path,
+    span: tuple[str | None, str | None],
+    mark: str | None = None,
+    *,
+    json: bool,
 ) -> tuple[bool, int]:
-    """Write the recording, and report; return whether it has all, and how many messages it has."""
+    """Write the recordings, and report; return whether they have all, and how many messages they have."""
+    if mark is not None and any(span):
+        raise LocalError("--mark states both ends of each recording; leave out --from and --to")
+    is_whole, count = True, 0
     with open_session(node) as session:
-        ask_holder = partial(ask, session, holder)
+        nearest = session.core.nearest_holder(holders)
+        ask_holder = partial(_ask, session, nearest)
         topics = [session.core.resolve(name, Right.READ) for name in names]
-        is_marked = any(text is not None and text.startswith(_MARK) for text in span)
+        is_marked = mark is not None or any(text is not None and text.startswith(_MARK) for text in span)
         marks = [mark for topic in topics for mark in marks_of(ask_holder, topic)] if is_marked else []
-        from_ns, to_ns = _ns(span[0], 0, marks), _ns(span[1], _END_NS, marks, is_end=True)
         titles = [_name_of(topic, name) for name, topic in zip(names, topics, strict=True)]
-        history = History(ask_holder, list(zip(topics, titles, strict=True)), from_ns, to_ns)
-        if not history.readers:
-            raise LocalError(f"{holder} has no capsule of {', '.join(names)}")
-        count = _write(output, history.messages())
+        spans = {output: (_ns(span[0], 0, marks), _ns(span[1], _END_NS, marks, is_end=True))}
+        if mark is not None:
+            windows = enumerate(_windows(mark, marks), 1)
+            spans = {output.with_stem(f"{output.stem}-{at}"): (each.from_ns, each.to_ns) for at, each in windows}
+        for file, (from_ns, to_ns) in spans.items():
+            history = History(ask_holder, list(zip(topics, titles, strict=True)), from_ns, to_ns)
+            if not history.readers:
+                raise LocalError(f"{', '.join(holders)}: no capsule of {', '.join(names)}")
+            written = _write(file, history.messages())
+            count += written
+            is_whole &= _report(history, json=json)
+            if mark is not None:
+                report("window", f"{written} messages are in {file}", json=json, file=str(file), messages=written)
+    for choice in nearest.choices:
+        print_json({"event": "holder", **choice._asdict()}) if json else print_text(choice.words())
+    return is_whole, count
+
+
+def _report(history: History, *, json: bool) -> bool:
+    """Report what was read of the capsules; return whether that is all."""
     is_whole = True
     for reader in history.readers:
         of = {each: history.names[each] for each in reader.descriptor.topics if each in history.names}
@@ -136,7 +172,15 @@ def _export(
             print_text(f"{topic}: {reader.audit.records} records, signed by {about['signer']}")
             for line in [*(f"mark {each.name}" for each in reader.opener.marks), *problems]:
                 print_text(f"  {line}")
-    return is_whole, count
+    return is_whole
+
+
+def _ask(session: Session, holder: NearestHolder, request: HolderRequest) -> HolderAnswer:
+    """Return the answer of the nearest holder. Raises ``GdpError``: there is none."""
+    driver = session.driver
+    driver.run(lambda: holder.begin(request, driver.now_s()))
+    driver.wait(lambda: holder.is_done, None)
+    return driver.run(holder.poll_answer) or HolderAnswer()
 
 
 def _write(output: Path, messages: Iterator[PastMessage]) -> int:
@@ -156,15 +200,21 @@ def _name_of(topic: Topic, name: str) -> str:
     return name if metadata is None else str(metadata.get("name", name))
 
 
+def _windows(name: str, marks: Sequence[NamedMark]) -> list[Mark]:
+    """Return the windows of the marks whose first words these are. Raises ``LocalError``: there is none."""
+    found = {each.time_ns: each.window for each in sorted(marks) if f"{each.name} ".startswith(f"{name} ")}
+    if not found:
+        raise LocalError(f"mark {name}: known marks: {', '.join(sorted({each.name for each in marks})) or 'none'}")
+    return list(found.values())
+
+
 def _ns(text: str | None, otherwise: int, marks: Sequence[NamedMark], *, is_end: bool = False) -> int:
     """Return a time in Unix nanoseconds; of a mark, where its window begins or ends. Raises ``LocalError``: none."""
     if text is None:
         return otherwise
     if text.startswith(_MARK):
-        windows = [each.window for each in sorted(marks) if each.name == text.removeprefix(_MARK)]
-        if not windows:
-            raise LocalError(f"{text}: known marks: {', '.join(sorted({each.name for each in marks})) or 'none'}")
-        return windows[-1].to_ns if is_end else windows[-1].from_ns
+        last = _windows(text.removeprefix(_MARK), marks)[-1]
+        return last.to_ns if is_end else last.from_ns
     if _SECONDS.fullmatch(text):
         return int(float(text) * 1e9)
     try:

@@ -217,8 +217,8 @@ class ProxyConfig(Section):
                     if key:
                         yield (side, index, "keep", key), f"{side}[{at}] states another one for the same capsule"
                 for event in () if rule.keep is None else rule.keep.when:
-                    if event.startswith("/") and not self._is_topic(event):
-                        yield (side, index, "keep", "when"), f"{event}: no rule of this file names such a topic"
+                    if event.startswith("/") and not self._is_event(event):
+                        yield (side, index, "keep", "when"), f"{event}: no rule of this file names such a topic or call"
                 if side == "expose" and rule.stop is not None and rule.at_once != 1:
                     ordered, needs = "with 'state: ordered' nothing is broken off", "this needs 'at_once: 1'"
                     yield (side, index, "stop"), ordered if rule.is_ordered else needs
@@ -227,8 +227,12 @@ class ProxyConfig(Section):
                 if rule.is_ordered and rule.at_once is not None:
                     yield (side, index, "at_once"), "with 'state: ordered' it is always 1"
 
-    def _is_topic(self, local: str) -> bool:
-        return any(rule.kind == "topic" and rule.matches(local) for rule in (*self.expose, *self.imports))
+    def _is_event(self, local: str) -> bool:
+        """Return whether a topic has this name, an exposed service, or a goal or result of an exposed action."""
+        action, _, part = local.rpartition("/")
+        calls = {"service": local, "action": action if part in {"goal", "result"} else ""}
+        is_topic = any(rule.kind == "topic" and rule.matches(local) for rule in (*self.expose, *self.imports))
+        return is_topic or any(rule.kind in calls and rule.matches(calls[rule.kind]) for rule in self.expose)
 
     def _faults(self) -> Iterator[Fault]:
         if self.record is not None and not self.imports:

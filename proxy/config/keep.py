@@ -36,7 +36,8 @@ def read_span(value: object) -> object:
     return float(value[:-1]) if isinstance(value, str) and _SPAN.fullmatch(value) else value
 
 
-def _listed(value: object) -> object:
+def listed(value: object) -> object:
+    """Return a text as a tuple of one; a list as a tuple."""
     return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
 
 
@@ -66,15 +67,16 @@ class Keep(Section):
     after: Span = Field(default=None, ge=0, le=HOUR_S, description="Time after an event.")
     when: Annotated[
         tuple[str, ...],
-        BeforeValidator(_listed),
+        BeforeValidator(listed),
         WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}),
     ] = Field(
         default=(),
-        description="Events: a message of a topic that a rule names (`/estop`), `uplink-lost`, or a fault's word.",
+        description="Events: a message of a topic (`/estop`), a call of an exposed service (`/dock`), a goal or result"
+        " of an exposed action (`/drive/goal`, `/drive/result`), `uplink-lost`, or a fault's word.",
     )
     to: Annotated[
         tuple[Annotated[str, Field(min_length=1)], ...],
-        BeforeValidator(_listed),
+        BeforeValidator(listed),
         WithJsonSchema({"anyOf": [{"type": "string", "minLength": 1}, {"type": "array", "items": {"type": "string"}}]}),
     ] = Field(
         min_length=1,

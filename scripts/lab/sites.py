@@ -14,7 +14,7 @@ from typing import Final
 from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.limits import COST_AUTO
 from gdp.names import Name
-from gdp.service.replication import Mode, Replication
+from gdp.service.replication import NEAREST
 from gdp.session.protocol.client_core import Call
 from gdp.session.protocol.core import SessionCore
 from gdp.session.protocol.server_core import ServerCore
@@ -26,7 +26,6 @@ SERVICE: Final = "plan"
 ROBOT: Final = "a0/robot"
 SIZE: Final = 200
 STEP_S: Final = 0.02
-NEAREST: Final = Replication(Mode.NEAREST)
 
 
 @dataclass(slots=True, eq=False)
@@ -94,10 +93,24 @@ class Sites:
         for k in order:
             self.serve(k)
         self.world.network.taps.append(self._tap)
+        self.settle()
+
+    def service(self, site: int) -> str:
+        """Return the name that a site's replica serves."""
+        del site
+        return SERVICE
+
+    def settle(self) -> None:
+        """Let the robot find all replicas."""
         self.begin()
-        assert self.run(5.0, lambda: self.requests[-1].call.is_done and len(self.known()) == len(order))
+        assert self.run(5.0, lambda: self.requests[-1].call.is_done and len(self.known()) == len(self.apart_s) + 1)
         self.run(1.0)
         self.requests.clear()
+
+    def answer(self, label: str, request: bytes) -> bytes:
+        """Return what a replica answers."""
+        del request
+        return label.encode()
 
     @property
     def now_s(self) -> float:
@@ -132,9 +145,9 @@ class Sites:
 
     def _open(self, label: str) -> None:
         member = self.world.members[label]
-        rights = [Right.CALL] if label == ROBOT else [Right.SERVE]
-        topic = self.world.topic(SERVICE, member, rights)
-        self.cores[label] = SessionCore(member, [topic], lambda: next(self._starts))
+        right, sites = (Right.CALL, range(len(self.apart_s) + 1)) if label == ROBOT else (Right.SERVE, [int(label[1])])
+        topics = [self.world.topic(name, member, [right]) for name in {self.service(site): None for site in sites}]
+        self.cores[label] = SessionCore(member, topics, lambda: next(self._starts))
 
     def label(self, site: int) -> str:
         """Return the label of a site's replica."""
@@ -144,7 +157,9 @@ class Sites:
         """Let a replica serve from now on."""
         label = self.label(site)
         core = self.cores[label]
-        self.serving[label] = core.serve(core.resolve(SERVICE, Right.SERVE), at_once=None, is_global=True, urgent=False)
+        self.serving[label] = core.serve(
+            core.resolve(self.service(site), Right.SERVE), at_once=None, is_global=True, urgent=False
+        )
         self.send(label)
 
     def send(self, label: str) -> None:
@@ -238,13 +253,13 @@ class Sites:
         while server is not None and server.turns:
             turn = server.turns.popleft()
             self.executed.setdefault(turn.request[:12], []).append(label)
-            self.world.network.call(self.work_s, partial(self._finish, label, server, turn.number))
+            self.world.network.call(self.work_s, partial(self._finish, label, server, turn.number, turn.request))
 
-    def _finish(self, label: str, server: ServerCore, number: int) -> None:
+    def _finish(self, label: str, server: ServerCore, number: int, request: bytes) -> None:
         if label in self.frozen:
-            self.world.network.call(STEP_S, partial(self._finish, label, server, number))
+            self.world.network.call(STEP_S, partial(self._finish, label, server, number, request))
         elif self.serving.get(label) is server:
-            server.finish(number, label.encode(), self.now_s)
+            server.finish(number, self.answer(label, request), self.now_s)
             self.send(label)
 
     def _tap(self, _at_s: float, a: str, _b: str, frame: bytes) -> None:

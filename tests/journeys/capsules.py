@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
 from gdp.capsule.opening import CapsuleOpener, Kept
@@ -26,6 +24,7 @@ from gdp.stores.capsule_store import CapsuleStore, StoreLimits
 from gdp.stores.holder_exchange import Steps
 from gdp.stores.holder_upkeep import HolderUpkeep
 from gdp.trust.right import Right
+from lab.inline import Inline
 from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow
 
@@ -33,18 +32,6 @@ STORE = "/store"
 _STEP_S = 0.02  # between two turns of work
 BACKGROUND = SendOptions(priority="background")
 LIMITS = StoreLimits(owner_bytes=1 << 30, spare_bytes=0)
-
-
-class Inline(Executor):
-    """Pool whose work is done at once."""
-
-    def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
-        future = Future[Any]()
-        try:
-            future.set_result(work(*given, **named))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 @dataclass

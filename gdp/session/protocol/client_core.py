@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from gdp.client.participant import Message, Participant, ServiceOptions, Topic
 from gdp.client.publisher import Publisher
@@ -18,7 +18,7 @@ from gdp.intervals import LOOK_S
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End, Failure, Probe, Stop
 from gdp.service.frames import PATIENCE_MAX_MS, Outcome, Request
-from gdp.service.replication import Replication
+from gdp.service.replication import NEAREST, Replication
 from gdp.session.protocol.errors import CallError, CallTimeoutError, NoServerError, SessionError
 from gdp.session.protocol.messages import Response
 from gdp.session.protocol.wire import LEAVING, REQUEST, SERVING, read_response, stop_to_wire
@@ -51,6 +51,13 @@ class Call:
     def is_done(self) -> bool:
         """Return whether it has ended."""
         return self.response is not None or self.error is not None
+
+
+class NearestPath(NamedTuple):
+    """Path to the nearest server: whether that is silent, and the cost."""
+
+    is_silent: bool
+    cost: int
 
 
 class ClientCore:
@@ -90,6 +97,11 @@ class ClientCore:
     def is_idle(self) -> bool:
         """Return whether no call is active."""
         return not self._unasked and not any(len(each) for each in self._dispatches.values())
+
+    def path(self, now_s: float) -> NearestPath | None:
+        """Return the path to the nearest server, whose cost the switch states from now on; None: there is no server."""
+        ranking = self._dispatch_of(NEAREST, now_s).ranking(now_s)
+        return NearestPath(ranking[0][2], ranking[0][1]) if ranking else None
 
     def begin(self, call: Call, now_s: float) -> None:
         """Begin a call; it ends later with ``response`` or ``error``."""

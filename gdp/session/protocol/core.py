@@ -20,6 +20,7 @@ from gdp.service.replication import Mode, Replication
 from gdp.session.protocol.client_core import Call, ClientCore
 from gdp.session.protocol.errors import DelegationError
 from gdp.session.protocol.messages import DelegatedName, Message, NameLike, describe
+from gdp.session.protocol.nearest_holder import NearestHolder
 from gdp.session.protocol.server_core import ServerCore
 from gdp.session.protocol.wire import read_message
 from gdp.trust.right import Right
@@ -199,6 +200,10 @@ class SessionCore:
         Raises:
             LocalError: the name is read or served already in this session.
         """
+        self.client(topic, paths, is_session=is_session).begin(call, now_s)
+
+    def client(self, topic: Topic, paths: int = 1, *, is_session: bool = False) -> ClientCore:
+        """Return the client of a name. Raises ``LocalError``: as for ``call``."""
         client = self._clients.get(topic.name)
         if client is None:
             client = ClientCore(
@@ -211,7 +216,13 @@ class SessionCore:
             )
             self._receivers[topic.name] = self._clients[topic.name] = client
             self._services.append(client)
-        client.begin(call, now_s)
+        return client
+
+    def nearest_holder(self, services: Iterable[str]) -> NearestHolder:
+        """Return a reading at the nearest of several holders. Raises ``LocalError``: as for ``resolve``, ``call``."""
+        holder = NearestHolder({each: self.client(self.resolve(each, Right.CALL)) for each in services})
+        self._services.append(holder)
+        return holder
 
     def add_service(self, service: _Keeper, names: Iterable[Name]) -> None:
         """Have a keeper handled, and get what comes on the names that it calls."""

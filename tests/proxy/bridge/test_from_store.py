@@ -6,15 +6,18 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import pytest
+
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.session.keeping import CapsuleKeeper
 from gdp.stores.capsule_store import stored
 from gdp.trust.right import Right
+from lab.inline import Inline
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.keeping import TopicKeeper
 from proxy.config.keep import Keep
 from proxy.node.node import ProxyNode
-from tests.journeys.capsules import Holder, Inline
+from tests.journeys.capsules import Holder
 from tests.proxy.bridge import known
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Granted, Machine, Sites
 from tests.proxy.rule_files import proxy, rules
@@ -25,19 +28,24 @@ COUNT = 60
 def keeper_of(sites: Sites, machine: Machine, folder: Path) -> TopicKeeper:
     """Give a machine a keeper, with a delegation to call the holder."""
     identity = next(each for each in sites.world.identities.values() if each.name == machine.member.name)
-    service = sites.world.topic("store", machine.member, [Right.CALL], kind="service")
-    held: DelegationStore = Granted(folder, [service])
+    names = ("store", "gone")
+    services = [sites.world.topic(name, machine.member, [Right.CALL], kind="service") for name in names]
+    held: DelegationStore = Granted(folder, services)
     keeper = TopicKeeper(machine.member, identity, folder, held)
     keeper.capsules = CapsuleKeeper(machine.member, identity, folder, start=7, pool=Inline())
     machine.context = machine.bridge._context = replace(machine.context, keeper=keeper)
     return keeper
 
 
-def test_a_late_reader_gets_the_past_from_a_holder_then_what_is_live(tmp_path: Path) -> None:
+@pytest.mark.parametrize("history", ["from-store", "{store: [gone, store]}"])
+def test_a_late_reader_gets_the_past_from_a_holder_then_what_is_live(
+    tmp_path: Path, history: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
     sites = Sites(tmp_path)
     sites.world.add_member("nuc3/holder", "nuc3")
     robot = sites.add(ROBOT, expose=[f"name: /chatter, type: {known.STRING}, reliable: true, latched: false"])
-    server = sites.add(SERVER, imports=[f"name: /chatter, type: {known.STRING}, history: from-store"])
+    server = sites.add(SERVER, imports=[f"name: /chatter, type: {known.STRING}, history: {history}"])
     holder = Holder(sites.world, tmp_path / "holder", "nuc3/holder", service="store")
     keeper = keeper_of(sites, robot, tmp_path / "robot")
     keeper_of(sites, server, tmp_path / "server")
@@ -55,6 +63,7 @@ def test_a_late_reader_gets_the_past_from_a_holder_then_what_is_live(tmp_path: P
     assert sites.run(20, lambda: len(ear.texts) >= COUNT)
     assert ear.texts == [str(number) for number in range(COUNT)]
     assert server.faults == {}
+    assert "past of /chatter is read at store: " in caplog.text
 
 
 def test_the_first_rule_that_keeps_may_come_with_a_reload(tmp_path: Path) -> None:

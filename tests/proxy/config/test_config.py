@@ -227,6 +227,24 @@ def test_rules_of_one_capsule_agree_and_an_error_names_both(place: Path, key: st
     assert "keep.capsule" in refusal(place, good.replace("drive", "A/B", 1))
 
 
+@pytest.mark.parametrize("event", ["/dock", "/drive/goal", "/drive/result", "/a"])
+def test_windows_may_stand_around_calls_of_what_is_exposed(place: Path, event: str) -> None:
+    (place / "state").mkdir()
+    named = [
+        f"name: /a, type: std_msgs/msg/Bool, keep: {{to: store, when: {event}}}",
+        "kind: service, name: /dock, type: std_srvs/srv/Trigger",
+        "kind: action, name: /drive, type: nav2_msgs/action/NavigateToPose",
+    ]
+    text = f"ros: {{endpoint: ros2, domain: 0}}\nstate: state\nexpose:\n{rules(*named)}"
+    assert proxy(place, text).expose[0].keep is not None
+    for other in ("/other", "/drive", "/drive/cancel", "/dock/goal"):
+        complaint = f"keep.when: {other}: no rule of this file names such a topic or call"
+        assert complaint in refusal(place, text.replace(f"when: {event}}}", f"when: {other}}}"))
+    imported = text.replace("  - {kind: service", "import:\n  - {kind: service")
+    if event != "/a":
+        assert "no rule of this file names such a topic or call" in refusal(place, imported)
+
+
 @pytest.mark.parametrize(("side", "history"), [("expose", "from-store"), ("import", "10")])
 def test_the_past_comes_from_a_store_to_importers_alone(place: Path, side: str, history: str) -> None:
     text = f"ros: {{endpoint: ros2, domain: 0}}\n{side}:\n{rules(f'name: /a, history: {history}')}"
