@@ -48,7 +48,7 @@ class Reading:
         if (answer := self.holder.poll_answer()) is not None:
             if self.reader is None:
                 (descriptor,) = given(answer.descriptors)
-                self.reader = CapsuleReader(descriptor, {self.name: self.secrets})
+                self.reader = CapsuleReader(descriptor, {descriptor.topic.name: self.secrets})
             else:
                 self.kept += self.reader.handle_response(answer)
         if self.holder.is_idle and not self.is_done:

@@ -18,9 +18,9 @@ from tests.proxy.bridge.test_from_store import keeper_of
 def marks_of(sites: Sites, machine: Machine, folder: Path, when: Sequence[str]) -> list[str]:
     """Keep a topic of a machine around events; return the names of the marks that come."""
     marks, topic, keeper = list[str](), Name(b"t" * 32), keeper_of(sites, machine, folder)
-    kept: Any = SimpleNamespace(mark=lambda name, _time_ns: marks.append(name), poll_faults=list)
+    kept: Any = SimpleNamespace(mark=lambda name, _time_ns: marks.append(name), name=topic)
     keeper._when = {each: {topic} for each in when}
-    capsules: Any = SimpleNamespace(topics={topic: kept}, ended={}, handle=lambda _: None, get_timer=lambda: None)
+    capsules: Any = SimpleNamespace(topics={topic: kept}, capsules=[], handle=lambda _: None, get_timer=lambda: None)
     keeper.capsules = capsules
     return marks
 
