@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from dataclasses import fields
 from functools import cache
 from itertools import permutations
+from pathlib import Path
 from random import Random
 from typing import Any, Final
 
 import pytest
 from numpy.testing import assert_array_equal
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from proxy.serial.channel import Channel
 from proxy.serial.converter import MessageConverter
 from proxy.serial.schema import DefinitionError
+from tests.proxy.endpoints.ros2_net import needs
 from tests.proxy.serial.drawn import drawn_message, wire_of
 
 DISTROS: Final = (Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL)
@@ -29,7 +33,11 @@ def store_of(distro: Stores) -> Typestore:
 
 @cache
 def channel(distro: Stores, type_name: str) -> Channel:
-    text, _ = store_of(distro).generate_msgdef(type_name, 2)
+    return of_store(store_of(distro), distro, type_name)
+
+
+def of_store(store: Typestore, distro: Stores, type_name: str) -> Channel:
+    text, _ = store.generate_msgdef(type_name, 2)
     return Channel("", type_name, 2, hash=f"of {distro.value}", definition=text, definition_format="msg")
 
 
@@ -69,6 +77,49 @@ def test_every_common_message_arrives_with_all_that_both_distributions_know(ther
         assert_kept(message, store_of(here).deserialize_cdr(got, name))
     assert len(names) > 100
     assert differing or {there, here} <= {Stores.ROS2_JAZZY, Stores.ROS2_KILTED}
+
+
+PARTS: Final = {".srv": ("Request", "Response"), ".action": ("Goal", "Result", "Feedback")}
+EMPTY: Final = "uint8 structure_needs_at_least_one_member\n"
+
+
+@cache
+def with_parts(distro: Stores) -> tuple[Typestore, list[str]]:
+    """Return a store with the parts of the services and actions of the installed wheels, and their names.
+
+    Their own lines are those of Jazzy; what they contain is the distribution's, or they are left out.
+    """
+    store, names = get_typestore(distro), list[str]()
+    for path in sorted((Path(sys.prefix) / "share").glob("*/*/*.*")):
+        if path.suffix not in PARTS or (path.parts[-3] == "test_msgs" and path.suffix == ".srv"):
+            continue
+        texts = re.split(r"^---$", path.read_text(), flags=re.MULTILINE)
+        for part, text in zip(PARTS[path.suffix], texts, strict=True):
+            name = f"{path.parts[-3]}/msg/{path.stem}{part}"
+            is_empty = not re.sub(r"#.*|\w+ \w+ *=.*", "", text).strip()
+            found = get_types_from_msg(EMPTY if is_empty else text, name)
+            needed = set(re.findall(r"'(\w+/msg/\w+)'", str(found[name])))
+            if name not in names and needed <= store.fielddefs.keys():
+                store.register(found)
+                names.append(name)
+    return store, names
+
+
+@pytest.mark.parametrize(("there", "here"), list(permutations(DISTROS, 2)), ids=lambda each: each.value)
+def test_services_and_actions_arrive_with_all_that_both_distributions_know(there: Stores, here: Stores) -> None:
+    needs("std_srvs", "nav_msgs", "test_msgs")
+    (theirs, names), (ours, known) = with_parts(there), with_parts(here)
+    both = [each for each in names if each in known]
+    for number, name in enumerate(both):
+        source, target = (of_store(store, distro, name) for store, distro in ((theirs, there), (ours, here)))
+        message = drawn_message(theirs, name, Random(number), {})
+        got = MessageConverter(source, target, is_strict=False).convert(wire_of(theirs, 2, message, name))
+        assert_kept(message, ours.deserialize_cdr(got, name))
+    assert {"nav_msgs/msg/GetMapResponse", "sensor_msgs/msg/SetCameraInfoRequest", "std_srvs/msg/TriggerResponse"} <= {
+        *both
+    }
+    assert len(both) > 40
+    assert {"test_msgs/msg/FibonacciGoal", "test_msgs/msg/FibonacciResult"} <= {*both}
 
 
 def test_range_differs_by_its_variance_alone() -> None:
