@@ -29,7 +29,7 @@ from gdp.requests import Backoff
 from gdp.stores.bucket import Bucket, ChangedError, StoredObject
 from gdp.stores.bucket_folder import object_key
 from gdp.stores.capsule_ring import DESCRIPTOR
-from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, objects_of
+from gdp.stores.capsule_store import CapsuleStore, StoredCapsule, object_of, objects_of
 from gdp.stores.segments import SUFFIX
 
 log = logging.getLogger(__name__)
@@ -48,7 +48,6 @@ class BucketUpkeep(ClosedOnExit):
 
     def __init__(self, store: CapsuleStore, bucket: Bucket, age_s: float = MINUTE_S) -> None:
         self._store, self._bucket, self._age_s = store, bucket, age_s
-        self._objects: dict[Name, dict[int, StoredObject]] = {}  # those whose records are all the writer's
         self._lacking_s: dict[Name, float] = {}  # since when the bucket lacks records of an open segment
         self._claim = ""  # tag of ours
         self._listed_s = 0.0
@@ -86,19 +85,17 @@ class BucketUpkeep(ClosedOnExit):
         """
         is_checked = False
         for capsule in self._store.capsules:
-            segments, objects = capsule.segments, self._objects.setdefault(capsule.name, {})
+            segments = capsule.segments
             segments.fetch = partial(self._fetch, capsule)
-            dropped, due = set(objects).difference(segments.offsets), self._due(capsule, now_s)
-            if (dropped or due) and not is_checked:
-                self._check_claim()
-                is_checked = True
-            for offset in dropped:
-                self._bucket.delete(object_key(capsule.name, offset))
-                self._set(capsule, offset, None)
-            for offset in due:
-                if self._is_closing.is_set() or not self._upload(capsule, offset):
+            for offset in self._due(capsule, now_s):
+                if not is_checked:
+                    self._check_claim()
+                    is_checked = True
+                if not segments.size_of(offset):
+                    self._bucket.delete(object_key(capsule.name, offset))
+                    self._set(capsule, offset, None)
+                elif self._is_closing.is_set() or not self._upload(capsule, offset):
                     break  # what follows is not confirmed before it
-                capsule.backed = max(capsule.backed or 0, _end_of(objects))
         self._evict()
         if now_s >= self._listed_s + HOUR_S:
             self._check_claim()
@@ -142,14 +139,15 @@ class BucketUpkeep(ClosedOnExit):
             raise StoreError(self._store.refusal)
 
     def _due(self, capsule: StoredCapsule, now_s: float) -> list[int]:
-        """Return the segments that are to be uploaded now, in order."""
-        segments, objects = capsule.segments, self._objects[capsule.name]
-        lacking = [
-            offset
-            for offset in segments.offsets
-            if offset not in segments.absent
-            and (offset not in objects or objects[offset].size != segments.size_of(offset))
-        ]
+        """Return the segments to upload now, and those that were dropped, in order; only changed ones are looked at."""
+        segments, lacking = capsule.segments, list[int]()
+        for offset in sorted(segments.changed.copy()):
+            with self._store.lock:  # nothing is appended meanwhile
+                known, size = object_of(self._store.index, capsule.name, offset), segments.size_of(offset)
+                if offset in segments.absent or size == (0 if known is None else known.size):
+                    segments.changed.discard(offset)
+                else:
+                    lacking.append(offset)
         if segments.last not in lacking:
             self._lacking_s.pop(capsule.name, None)
         elif now_s < self._lacking_s.setdefault(capsule.name, now_s) + self._age_s:
@@ -158,17 +156,20 @@ class BucketUpkeep(ClosedOnExit):
 
     def _upload(self, capsule: StoredCapsule, offset: int) -> bool:
         """Have a segment in the bucket as it is now; return whether that was possible."""
-        segments, name, objects = capsule.segments, capsule.name, self._objects[capsule.name]
+        segments, name, index = capsule.segments, capsule.name, self._store.index
         size = segments.size_of(offset)
         data = segments.read(offset, size)[1]
         if not size or len(data) != size or proven_bytes(capsule, data) != size:
             self._store.note(name, f"the segment at {offset} is damaged, so the bucket does not get it")
             return False
-        if not objects:
+        with index.reading() as open_index:
+            has_objects = open_index.execute("SELECT 1 FROM objects WHERE capsule = ? LIMIT 1", (name,)).fetchone()
+        if has_objects is None:
             self._put(f"{name.to_text()}/{DESCRIPTOR}", capsule.descriptor.to_cbor(), None)
-        before = objects.get(offset)
+        before = object_of(index, name, offset)
         tag = self._put(object_key(name, offset), data, None if before is None else before.tag)
         self._set(capsule, offset, StoredObject(size, tag))
+        capsule.backed = max(capsule.backed or 0, offset + size)
         if offset == segments.last:
             self._lacking_s.pop(name, None)
         return True
@@ -194,7 +195,7 @@ class BucketUpkeep(ClosedOnExit):
         if not self._readers.acquire(blocking=False):
             raise StoreError(f"{self._bucket.url}: it is slow, and others wait for it; try again")
         try:
-            size, known = capsule.segments.size_of(offset), self._objects.get(capsule.name, {}).get(offset)
+            size, known = capsule.segments.size_of(offset), object_of(self._store.index, capsule.name, offset)
             found = self._bucket.get(object_key(capsule.name, offset))
             data, tag = found or (b"", "")
             if known is not None and tag != known.tag:
@@ -234,18 +235,17 @@ class BucketUpkeep(ClosedOnExit):
     def _compare_capsule(self, capsule: StoredCapsule, listed: Mapping[int, StoredObject]) -> None:
         segments, known = capsule.segments, objects_of(self._store.index, capsule.name)
         segments.fetch = partial(self._fetch, capsule)
-        objects = self._objects.setdefault(capsule.name, {})
         before = segments.end
         for offset in sorted({*known, *listed}):
             found, given = listed.get(offset), known.get(offset)
             if found is not None and found == given:
-                objects[offset] = found
                 self._store.take_backed(capsule, offset, found.size)
             else:
                 self._judge(capsule, offset, given, self._bucket.get(object_key(capsule.name, offset)))
         if segments.end != before:
             self._store.resume(capsule)
-        capsule.backed = max(capsule.backed or 0, _end_of(objects))
+        last = next(reversed(objects_of(self._store.index, capsule.name).items()), None)
+        capsule.backed = max(capsule.backed or 0, 0 if last is None else last[0] + last[1].size)
 
     def _judge(
         self, capsule: StoredCapsule, offset: int, given: StoredObject | None, found: tuple[bytes, str] | None
@@ -265,15 +265,11 @@ class BucketUpkeep(ClosedOnExit):
         self._store.take_backed(capsule, offset, size, data[:size])
 
     def _set(self, capsule: StoredCapsule, offset: int, found: StoredObject | None) -> None:
-        objects = self._objects.setdefault(capsule.name, {})
         with self._store.index.writing() as index:
             index.execute("DELETE FROM objects WHERE capsule = ? AND offset = ?", (capsule.name, offset))
             if found is not None:
                 index.execute("INSERT INTO objects VALUES (?, ?, ?, ?)", (capsule.name, offset, *found))
-        if found is None:
-            objects.pop(offset, None)
-        else:
-            objects[offset] = found
+        capsule.segments.changed.add(offset)
 
     def _evict(self, more: int = 0) -> None:
         """Remove segments that the bucket has, those first that came first, until the cache has space."""
@@ -284,15 +280,17 @@ class BucketUpkeep(ClosedOnExit):
         found = [
             (each.segments.age_of(offset), each, offset)
             for each in self._store.capsules
-            for offset, known in self._objects.get(each.name, {}).copy().items()
-            if offset not in each.segments.absent and each.segments.size_of(offset) == known.size
+            for offset in each.segments.offsets
+            if offset not in each.segments.absent
         ]
         for _, capsule, offset in sorted(found, key=lambda each: each[0]):
             if excess <= 0:
                 return
+            known = object_of(self._store.index, capsule.name, offset)
             with self._store.lock:
                 size, is_last = capsule.segments.size_of(offset), offset == capsule.segments.last
-                if size and not is_last and offset not in capsule.segments.absent:
+                is_backed = known is not None and known.size == size
+                if is_backed and not is_last and offset not in capsule.segments.absent:
                     capsule.segments.evict(offset)
                     excess -= size
 
@@ -305,10 +303,6 @@ def proven_bytes(capsule: StoredCapsule, data: bytes) -> int:
             chain.handle_record(wire, may_skip=not end)
             end += len(wire)
     return end
-
-
-def _end_of(objects: Mapping[int, StoredObject]) -> int:
-    return max((offset + each.size for offset, each in dict(objects).items()), default=0)
 
 
 def _holder_of(claim: bytes) -> str:

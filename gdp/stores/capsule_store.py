@@ -244,7 +244,7 @@ class CapsuleStore(ClosedOnExit):
 
     def fetch_again(self, capsule: StoredCapsule, offset: int) -> bool:
         """Replace a damaged segment by that of the bucket; return whether it has it. Raises ``GdpError``: not now."""
-        segments, known = capsule.segments, objects_of(self.index, capsule.name).get(offset)
+        segments, known = capsule.segments, object_of(self.index, capsule.name, offset)
         if segments.fetch is None or known is None or known.size != segments.size_of(offset):
             return False
         if offset != segments.last:
@@ -530,6 +530,14 @@ def objects_of(index: TransactionFile, name: Name) -> dict[int, StoredObject]:
     with index.reading() as open_index:
         rows = open_index.execute("SELECT offset, size, tag FROM objects WHERE capsule = ? ORDER BY offset", (name,))
         return {offset: StoredObject(size, tag) for offset, size, tag in rows}
+
+
+def object_of(index: TransactionFile, name: Name, offset: int) -> StoredObject | None:
+    """Return what the bucket was given of one segment. Raises ``StoreError``: the index cannot be read."""
+    with index.reading() as open_index:
+        query = "SELECT size, tag FROM objects WHERE capsule = ? AND offset = ?"
+        row = open_index.execute(query, (name, offset)).fetchone()
+    return None if row is None else StoredObject(*row)
 
 
 def _marks(index: TransactionFile, name: Name) -> list[bytes]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
 from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,8 @@ class Segments(ClosedOnExit):
 
     Attributes:
         absent: offsets of the files that are elsewhere.
+        held_bytes: of all files; ``here_bytes``: of those that are here.
+        changed: offsets of the files whose size changed, or that were dropped; whom that concerns removes them.
         fetch: returns such a file, whole.
 
     Raises:
@@ -42,13 +45,15 @@ class Segments(ClosedOnExit):
         self._spare_bytes = spare_bytes
         self._sizes: dict[int, int] = {}  # by offset, rising
         self._last: int | None = None  # descriptor of the last file
-        self.absent: set[int] = set()
+        self._counting = threading.Lock()  # who reads may fetch
+        self.absent, self.changed = set[int](), set[int]()
+        self.held_bytes = self.here_bytes = 0
         self.fetch: Callable[[int], bytes] | None = None
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             for path in sorted(folder.glob("*" + SUFFIX)):
                 if size := path.stat().st_size:  # an empty one was begun before a crash
-                    self._sizes[int(path.stem, 16)] = size
+                    self._set(int(path.stem, 16), size)
         except (OSError, ValueError) as error:
             raise StoreError(f"{folder}: {error}") from error
 
@@ -71,16 +76,6 @@ class Segments(ClosedOnExit):
     def offsets(self) -> list[int]:
         """Return where each file begins."""
         return list(self._sizes)
-
-    @property
-    def held_bytes(self) -> int:
-        """Return the bytes of all files."""
-        return sum(self._sizes.values())
-
-    @property
-    def here_bytes(self) -> int:
-        """Return the bytes of those that are here."""
-        return self.held_bytes - sum(map(self.size_of, list(self.absent)))
 
     def size_of(self, offset: int) -> int:
         """Return the bytes of the file that begins at an offset; 0: there is none."""
@@ -110,7 +105,7 @@ class Segments(ClosedOnExit):
             except OSError:
                 os.ftruncate(handle, size)
                 raise
-            self._sizes[self.last] = size + len(data)
+            self._set(self.last, size + len(data))
         except OSError as error:
             raise StoreError(f"{self.folder}: {error.strerror}") from error
 
@@ -158,29 +153,26 @@ class Segments(ClosedOnExit):
         """
         self.close()
         write_all(self.folder, {self._path(offset).name: private(data)}, force=True)
-        self.absent.discard(offset)
         self._set(offset, len(data))
 
     def set_absent(self, offset: int, size: int) -> None:
         """Note that the file which begins at an offset is elsewhere, and has so many bytes; 0: it is nowhere."""
         self.close()
-        self.absent.add(offset)
-        self._set(offset, size)
+        self._set(offset, size, is_absent=True)
         if not size:
             self.drop(offset)
 
     def keep_fetched(self, offset: int, data: bytes) -> None:
         """Have an absent file here again. Raises ``LocalError``: the system refuses."""
         write_all(self.folder, {self._path(offset).name: private(data)}, force=True)
-        self.absent.discard(offset)
-        if not self.size_of(offset):  # it was dropped meanwhile
+        if not self._set(offset, None):  # it was dropped meanwhile
             self._path(offset).unlink(missing_ok=True)
 
     def evict(self, offset: int) -> None:
         """Remove a file that is elsewhere, too."""
         if offset == self.last:
             self.close()
-        self.absent.add(offset)
+        self._set(offset, None, is_absent=True)
         self._path(offset).unlink(missing_ok=True)
 
     def age_of(self, offset: int) -> float:
@@ -196,7 +188,7 @@ class Segments(ClosedOnExit):
             os.ftruncate(self._handle(), end - self.last)
         except OSError as error:
             raise StoreError(f"{self.folder}: {error.strerror}") from error
-        self._sizes[self.last] = end - self.last
+        self._set(self.last, end - self.last)
 
     def drop(self, offset: int) -> None:
         """Remove the file that begins at an offset; a power cut does not bring it back."""
@@ -204,8 +196,8 @@ class Segments(ClosedOnExit):
             self.close()
         self._path(offset).unlink(missing_ok=True)
         sync(self.folder)
+        self._set(offset, 0)
         del self._sizes[offset]
-        self.absent.discard(offset)
 
     def close(self) -> None:
         """Close the last file."""
@@ -213,14 +205,28 @@ class Segments(ClosedOnExit):
             os.close(self._last)
             self._last = None
 
-    def _set(self, offset: int, size: int) -> None:
-        self._sizes = dict(sorted({**self._sizes, offset: size}.items()))
+    def _set(self, offset: int, size: int | None, *, is_absent: bool = False) -> bool:
+        """Note the size of a file, None: as before, and whether it is elsewhere; return whether it is known."""
+        with self._counting:
+            before, here = self._sizes.get(offset), 0 if offset in self.absent else self._sizes.get(offset, 0)
+            size = before if size is None else size
+            (self.absent.add if is_absent and size is not None else self.absent.discard)(offset)
+            if size is None:
+                return False
+            self.held_bytes += size - (before or 0)
+            self.here_bytes += (0 if is_absent else size) - here
+            if size != before:
+                self.changed.add(offset)
+                is_between = before is None and offset < self.last
+                self._sizes[offset] = size
+                self._sizes = dict(sorted(self._sizes.items())) if is_between else self._sizes
+            return True
 
     def _begin_file(self, offset: int) -> None:
         self.close()
         flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
         self._last = os.open(self._path(offset), flags, 0o600)
-        self._sizes[offset] = 0
+        self._set(offset, 0)
         sync(self.folder)
 
     def _handle(self) -> int:

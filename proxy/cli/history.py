@@ -68,7 +68,7 @@ def export(
     Exit 1: something is damaged, missing, or closed without a grant of its epoch; it is named.
     """
     with failing_clearly():
-        is_whole, count = _export(names, node, holder or ["store"], output, (from_, to), mark, json=json)
+        is_whole, count = _export(names, node, holder or ["store"], output, (from_, to, mark), json=json)
         if json:
             print_json({"event": "done", "file": str(output), "messages": count})
         else:
@@ -98,7 +98,7 @@ def replay(
     with tempfile.TemporaryDirectory(prefix="gdp-history-") as folder:
         with failing_clearly():
             output = Path(folder) / "history.mcap"
-            is_whole, _ = _export(names, node, holder or ["store"], output, (from_, to), json=json)
+            is_whole, _ = _export(names, node, holder or ["store"], output, (from_, to, None), json=json)
         try:
             replay_recording(
                 output, config, rate, skip_empty, wait_readers, data_plane=data_plane, json=json, logs=logs
@@ -108,27 +108,21 @@ def replay(
 
 
 def _export(
-    names: Sequence[str],
-    node: Path,
-    holders: Sequence[str],
-    output: Path,
-    span: tuple[str | None, str | None],
-    mark: str | None = None,
-    *,
-    json: bool,
+    names: Sequence[str], node: Path, holders: Sequence[str], output: Path, span: Sequence[str | None], *, json: bool
 ) -> tuple[bool, int]:
     """Write the recordings, and report; return whether they have all, and how many messages they have."""
-    if mark is not None and any(span):
+    from_, to, mark = span
+    if mark is not None and (from_ or to):
         raise LocalError("--mark states both ends of each recording; leave out --from and --to")
     is_whole, count = True, 0
     with open_session(node) as session:
         nearest = session.core.nearest_holder(holders)
         ask_holder = partial(_ask, session, nearest)
         topics = [session.core.resolve(name, Right.READ) for name in names]
-        is_marked = mark is not None or any(text is not None and text.startswith(_MARK) for text in span)
+        is_marked = mark is not None or any(text is not None and text.startswith(_MARK) for text in (from_, to))
         marks = [mark for topic in topics for mark in marks_of(ask_holder, topic)] if is_marked else []
         titles = [_name_of(topic, name) for name, topic in zip(names, topics, strict=True)]
-        spans = {output: (_ns(span[0], 0, marks), _ns(span[1], _END_NS, marks, is_end=True))}
+        spans = {output: (_ns(from_, 0, marks), _ns(to, _END_NS, marks, is_end=True))}
         if mark is not None:
             windows = enumerate(_windows(mark, marks), 1)
             spans = {output.with_stem(f"{output.stem}-{at}"): (each.from_ns, each.to_ns) for at, each in windows}

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from typing import Annotated, Final
 
-from pydantic import BeforeValidator, Field, WithJsonSchema
+from pydantic import BeforeValidator, Field
 from pydantic.config import JsonDict
 
 from gdp.client.send_options import HISTORY_BYTES_MAX, HISTORY_MESSAGES_MAX
 from gdp.config.schema import Section, or_short
 from gdp.intervals import DAY_S
-from proxy.config.keep import listed
+from proxy.config.keep import Services
 
 
 class History(Section):
@@ -23,14 +23,8 @@ class History(Section):
     max_bytes: int = Field(
         default=8 << 20, alias="bytes", ge=1, le=HISTORY_BYTES_MAX, description="Most bytes, as they travel."
     )
-    store: Annotated[
-        tuple[Annotated[str, Field(min_length=1)], ...] | None,
-        BeforeValidator(listed),
-        WithJsonSchema({"anyOf": [{"type": "string", "minLength": 1}, {"type": "array", "items": {"type": "string"}}]}),
-    ] = Field(
-        default=None,
-        min_length=1,
-        description="Imported topics: a holder's service, or a list: the nearest is read.",
+    store: Services | None = Field(
+        default=None, min_length=1, description="Imported topics: services of holders; the nearest is read."
     )
     age_s: float | None = Field(default=None, gt=0, le=DAY_S, description="Longest time in seconds. `null`: any.")
 

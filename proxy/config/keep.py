@@ -36,8 +36,7 @@ def read_span(value: object) -> object:
     return float(value[:-1]) if isinstance(value, str) and _SPAN.fullmatch(value) else value
 
 
-def listed(value: object) -> object:
-    """Return a text as a tuple of one; a list as a tuple."""
+def _listed(value: object) -> object:
     return (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
 
 
@@ -45,6 +44,13 @@ Span = Annotated[
     float | None,
     BeforeValidator(read_span),
     WithJsonSchema({"anyOf": [{"type": "number", "minimum": 0}, {"type": "string", "pattern": _SPAN.pattern}]}),
+]
+
+
+Services = Annotated[
+    tuple[Annotated[str, Field(min_length=1)], ...],
+    BeforeValidator(_listed),
+    WithJsonSchema({"anyOf": [{"type": "string", "minLength": 1}, {"type": "array", "items": {"type": "string"}}]}),
 ]
 
 
@@ -67,18 +73,14 @@ class Keep(Section):
     after: Span = Field(default=None, ge=0, le=HOUR_S, description="Time after an event.")
     when: Annotated[
         tuple[str, ...],
-        BeforeValidator(listed),
+        BeforeValidator(_listed),
         WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}),
     ] = Field(
         default=(),
-        description="Events: a message of a topic (`/estop`), a call of an exposed service (`/dock`), a goal or result"
-        " of an exposed action (`/drive/goal`, `/drive/result`), `uplink-lost`, or a fault's word.",
+        description="Events: a topic's message, a call of an exposed service, an exposed action's `/goal` or `/result`,"
+        " `uplink-lost`, or a fault's word.",
     )
-    to: Annotated[
-        tuple[Annotated[str, Field(min_length=1)], ...],
-        BeforeValidator(listed),
-        WithJsonSchema({"anyOf": [{"type": "string", "minLength": 1}, {"type": "array", "items": {"type": "string"}}]}),
-    ] = Field(
+    to: Services = Field(
         min_length=1,
         description="The holder's service, as `gdp delegate` named it, or 64 hex digits; or a list: each holds all.",
     )

@@ -13,6 +13,7 @@ from typing import Final
 from gdp.capsule.holder import Ask, HolderRequest
 from gdp.capsule.opening import Kept
 from gdp.capsule.reading import CapsuleReader, given
+from gdp.errors import GdpError
 from gdp.names import Name
 from gdp.session.keeping import CapsuleKeeper
 from gdp.session.protocol.nearest_holder import NearestHolder
@@ -102,10 +103,13 @@ class HolderSites(Sites):
             self.stores[self.label(site)] = holder
         self.run(1.0)
 
-    def answer(self, label: str, request: bytes) -> bytes:
-        """Return what a holder answers."""
+    def answer(self, label: str, request: bytes) -> bytes | str:
+        """Return what a holder answers, or why it refuses."""
         self.asked.append((self.now_s, int(label[1]), HolderRequest.from_cbor(request).ask))
-        return self.stores[label].handle(request, Name(b"r" * 32))
+        try:
+            return self.stores[label].handle(request, Name(b"r" * 32))
+        except GdpError as error:
+            return str(error)
 
     def begin_reading(self) -> Reading:
         """Return a reading that ``read`` continues."""

@@ -107,7 +107,7 @@ class Sites:
         self.run(1.0)
         self.requests.clear()
 
-    def answer(self, label: str, request: bytes) -> bytes:
+    def answer(self, label: str, request: bytes) -> bytes | str:
         """Return what a replica answers."""
         del request
         return label.encode()

@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.session.protocol.errors import NoServerError
+from gdp.errors import StoreError
+from gdp.names import Name
+from gdp.session.protocol.errors import NoServerError, SessionTimeoutError
 from lab.holder_sites import HolderSites, Reading
 from tests.draws import draws
 
@@ -90,6 +92,49 @@ def test_a_nearest_holder_that_lacks_records_is_no_end(tmp_path: Path) -> None:
     is_whole(sites, reading)
     assert [each.holder for each in reading.holder.choices] == ["store-0", "store-1"]
     assert {site for _, site in sites.reads_since(0)} == {0, 1, 2}  # whether the farthest has still more
+
+
+def test_a_reading_stays_where_it_is_when_a_nearer_holder_returns(tmp_path: Path) -> None:
+    sites = sites_at(tmp_path)
+    reading = sites.begin_reading()
+    sites.read(reading, 20, lambda: len(reading.kept) >= 5)
+    sites.kill(0)
+    sites.read(reading, 20, lambda: len(reading.kept) >= 20)
+    sites.restart(0)
+    sites.run(2.0)
+    returned_s = sites.now_s
+    assert sites.nearest() == {0}
+    assert sites.read(reading, 30)
+    is_whole(sites, reading)
+    assert [site for _, site in sites.reads_since(returned_s)][:-2] == [1] * (len(sites.reads_since(returned_s)) - 2)
+    assert [each.holder for each in reading.holder.choices] == ["store-0", "store-1"]
+
+
+def test_a_holder_that_refuses_is_named_and_another_one_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sites = sites_at(tmp_path)
+
+    def refuse(wire: bytes, _client: Name) -> bytes:
+        raise StoreError(f"the bucket is slow for {len(wire)} bytes")
+
+    monkeypatch.setattr(sites.stores["s0/edge0"], "handle", refuse)
+    reading = sites.begin_reading()
+    assert sites.read(reading, 30)
+    is_whole(sites, reading)
+    (choice,) = reading.holder.choices
+    assert choice.holder == "store-1"
+    assert "; store-0: every server refused: the bucket is slow" in choice.words()
+
+
+def test_a_reading_is_no_shorter_than_what_a_dead_holder_had(tmp_path: Path) -> None:
+    sites = sites_at(tmp_path, lacking=1)
+    sites.kill(2)
+    sites.run(4.0)
+    reading = sites.begin_reading()
+    sites.read(reading, 20, lambda: len(reading.kept) >= 40)
+    sites.kill(0)
+    with pytest.raises(SessionTimeoutError, match="store-0: no response"):
+        sites.read(reading, 30)
+    assert len(sites.sent) / 2 < len(reading.kept) < len(sites.sent)
 
 
 @pytest.mark.parametrize("dead", [(0,), (0, 1), (1, 2)])

@@ -3,7 +3,7 @@
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The client of each holder's service knows the cost of the path
 to it, and whether it is silent while it owes an answer (``gdp/service/nearest.py``). A reading stays at one holder.
 Offsets are the same at all, so the next holder continues at the byte. A holder may lack what another has: lists and
-marks are of all, and a capsule ends where none has more.
+marks are of all that answer, and a capsule ends where none of them has more, nor had.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from gdp.capsule.holder import Ask, HolderAnswer, HolderRequest
-from gdp.errors import GdpError
+from gdp.errors import GdpError, LocalError
 from gdp.intervals import LOOK_S, NEVER_S, PROMPT_S
 from gdp.limits import COST_UNREACHABLE
+from gdp.names import Name
 from gdp.service.replication import NEAREST
 from gdp.session.protocol.client_core import CALL_TIMEOUT_S, Call, ClientCore
 from gdp.session.protocol.errors import NoServerError
@@ -24,17 +25,23 @@ _OF_ALL: Final = (Ask.LIST, Ask.MARKS)
 
 
 class Choice(NamedTuple):
-    """At which holder a reading is from now on, and the cost of the path to each; None: it is silent or not there."""
+    """At which holder a reading is from now on, and why.
+
+    Attributes:
+        costs: of the path to each; None: it is silent or not there.
+        failure: of another one; empty: there was none.
+    """
 
     holder: str
     costs: dict[str, int | None]
+    failure: str
 
     def words(self) -> str:
         """Return the choice as a sentence."""
         stated = [
             f"{each} {'does not answer' if cost is None else f'costs {cost}'}" for each, cost in self.costs.items()
         ]
-        return f"read at {self.holder}: {', '.join(stated)}"
+        return f"read at {self.holder}: {', '.join(stated)}{self.failure and f'; {self.failure}'}"
 
 
 class NearestHolder:
@@ -55,7 +62,8 @@ class NearestHolder:
         self._tried: set[str] = set()  # holders that answered it, or refused
         self._owing: set[str] = set()  # as of the latest event
         self._found: HolderAnswer | None = None  # of those that have no more
-        self._refusal: GdpError | None = None
+        self._ends: dict[Name, int] = {}  # of the capsules, as holders stated
+        self._failure: GdpError | None = None  # a refusal, or that a holder has gone
         self._now_s, self._until_s = 0.0, NEVER_S
         self._begun_s = NEVER_S  # when the first holder was there
         self.choices: list[Choice] = []
@@ -71,7 +79,7 @@ class NearestHolder:
     def begin(self, request: HolderRequest, now_s: float) -> None:
         """Begin a request."""
         self._request, self._until_s, self.is_idle = request, now_s + CALL_TIMEOUT_S, False
-        self._calls, self._tried, self._found, self._refusal = {}, set(), None, None
+        self._calls, self._tried, self._found, self._failure = {}, set(), None, None
         self.handle_timer(now_s)
 
     def poll_answer(self) -> HolderAnswer | None:
@@ -115,14 +123,15 @@ class NearestHolder:
                 raise call.error or NoServerError("no answer")
             answer = HolderAnswer.from_cbor(call.response.payload)
         except GdpError as error:
-            self._refusal = error
+            self._failure = error
             return
         if answer.data and self._request.ask not in _OF_ALL:
             self._answer = answer
+            self._ends[self._request.capsule] = max(self._ends.get(self._request.capsule, 0), answer.head)
             if not self.choices or holder != self.choices[-1].holder:
                 paths = {each: client.path(self._now_s) for each, client in self._clients.items()}
                 costs = {each: None if path is None or path.is_silent else path.cost for each, path in paths.items()}
-                self.choices.append(Choice(holder, costs))
+                self.choices.append(Choice(holder, costs, str(self._failure or "")))
             return
         found = self._found or HolderAnswer()
         descriptors = {each.name: each for each in (*found.descriptors, *answer.descriptors)}
@@ -155,10 +164,10 @@ class NearestHolder:
             self._clients[holder].begin(call, self._now_s)
             self._calls[holder] = call
             self._owing = self._heard()
-        elif self._found is not None:
+        elif self._found is not None and self._found.offset >= self._ends.get(self._request.capsule, 0):
             self._answer = self._found
-        elif not self._calls and self._refusal is not None:
-            self._error = self._refusal
+        elif not self._calls and (self._failure is not None or self._found is not None):
+            self._error = self._failure or LocalError("no holder has the records that one had")
         elif not self._calls and self._now_s >= self._until_s:
             self._error = NoServerError(
                 f"{', '.join(self._clients)}: no holder within {CALL_TIMEOUT_S:g} s; start one with 'gdp store serve'"

@@ -20,11 +20,15 @@ import pytest
 from gdp.capsule.holder import Ask
 from gdp.errors import GdpError, LocalError, StoreError
 from gdp.intervals import HOUR_S
+from gdp.names import Name
 from gdp.stores import bucket as bucket_module
-from gdp.stores.bucket import Bucket
-from gdp.stores.bucket_folder import note_place, refuse_other_place, remove_with_bucket, stored_with_bucket
+from gdp.stores import bucket_upkeep
+from gdp.stores.bucket import Bucket, StoredObject
+from gdp.stores.bucket_folder import note_place, object_key, refuse_other_place, remove_with_bucket, stored_with_bucket
+from gdp.stores.capsule_store import object_of
 from gdp.stores.holder_exchange import run
 from gdp.stores.holder_upkeep import HolderUpkeep
+from gdp.stores.transactions import TransactionFile
 from tests.draws import TIMES
 from tests.gdp.capsule.log import SECOND_NS
 from tests.gdp.capsule.owned import NOW_S
@@ -81,6 +85,48 @@ def test_an_open_segment_is_uploaded_again_as_it_grows(site: BackedSite) -> None
         assert site.round() == site.capsule.segments.end
         assert site.objects == site.files
     assert site.data == DATA[: site.capsule.segments.end]
+
+
+def test_a_round_looks_only_at_segments_that_changed(site: BackedSite, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = list[int]()
+
+    def look(index: TransactionFile, name: Name, offset: int) -> StoredObject | None:
+        looked.append(offset)
+        return object_of(index, name, offset)
+
+    at = site.append(DATA[:9_000], 0).offset
+    site.round()
+    site.upkeep.run_round(site.now_s)  # sees that all is there
+    monkeypatch.setattr(bucket_upkeep, "object_of", look)
+    site.upkeep.run_round(site.now_s)
+    assert (looked, len(site.objects) > 1) == ([], True)
+    open_one = site.capsule.segments.last
+    site.append(DATA[at : at + 300], at)
+    site.upkeep.run_round(site.now_s)
+    assert set(looked) == {open_one}
+    site.round()
+    assert site.objects == site.files
+    key = object_key(ABOUT.name, 0)
+    site.bucket.delete(key)
+    site.upkeep.run_round(site.now_s + HOUR_S)  # the comparison finds that it is gone
+    site.upkeep.run_round(site.now_s + HOUR_S)
+    assert site.objects == site.files
+
+
+def test_counted_bytes_are_those_of_the_files(tmp_path: Path) -> None:
+    site = BackedSite(tmp_path, uuid.uuid4().hex, replace(LIMITS, capsule_bytes=12_000, cache_bytes=9_000))
+    at = 0
+    while at < len(DATA):
+        at = site.append(DATA[at : at + 1_500], at).offset
+        site.round()
+        segments = site.capsule.segments
+        assert segments.here_bytes == sum(site.files.values())
+        assert segments.held_bytes == sum(map(segments.size_of, segments.offsets))
+    assert 0 < segments.here_bytes < segments.held_bytes
+    assert segments.begin > 0
+    assert site.data == DATA[segments.begin :]
+    assert segments.here_bytes == sum(site.files.values())
+    site.close()
 
 
 def test_a_slow_topic_ends_its_segment_after_ten_minutes(site: BackedSite, monkeypatch: pytest.MonkeyPatch) -> None:
