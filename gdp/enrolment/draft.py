@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.stores.files import sync
 
 RESERVED_BYTES: Final = 1 << 20
 _RESERVE: Final = "reserved"
@@ -65,10 +66,6 @@ def publish_draft(draft: Path, directory: Path) -> None:
     """Rename a draft to its directory, also on the disk. Raises ``LocalError``: the system refuses."""
     try:
         draft.rename(directory)
-        folder = os.open(directory.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync(directory.parent)
     except OSError as error:
         raise LocalError(f"{directory}: {error.strerror}; name another --directory") from error

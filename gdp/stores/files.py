@@ -1,7 +1,8 @@
 """Files that hold keys: written whole or not at all, and private to their owner.
 
 I/O.
-A file appears under its name complete and synced, or not at all, so a kill in the middle leaves no partial file. A
+A file appears under its name complete and synced, or not at all, so a kill in the middle leaves no partial file; its
+name is synced, too. A
 private file has mode 0600 from its first byte on. It is read and written only where no other user could have read or
 replaced it (``ownership``); a link in its place is not followed.
 Each key folder has a ``.gitignore`` that covers all of it, also itself: Git reads one in every folder (gitignore(5)).
@@ -60,6 +61,7 @@ def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = Fa
         LocalError: a file exists already, one is private and others may write to the directory, or the system refuses.
     """
     try:
+        is_new = not directory.exists()
         directory.mkdir(mode=_DIRECTORY_MODE, parents=True, exist_ok=True)
         if any(not new.mode & (stat.S_IRWXG | stat.S_IRWXO) for new in files.values()):
             refuse_shared_folder(directory)
@@ -68,8 +70,20 @@ def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = Fa
                 refuse_existing(directory / name)
         for name, new in files.items():
             _write(directory / name, new, force=force)
+        sync(directory)
+        if is_new:
+            sync(directory.parent)
     except OSError as error:
         raise _translated(error, directory) from error
+
+
+def sync(path: Path) -> None:
+    """Put a file, or the names in a folder, on the disk. Raises ``OSError``: the system refuses."""
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def read_public(path: Path) -> bytes:

@@ -18,7 +18,7 @@ from typing import BinaryIO, Final
 
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError
-from gdp.stores.files import cut_unfinished_line, open_locked
+from gdp.stores.files import cut_unfinished_line, open_locked, sync
 from gdp.stores.ownership import refuse_shared_folder
 
 LEDGER: Final = "issued.jsonl"
@@ -77,11 +77,7 @@ def append_issued(directory: Path, member: Membership, unix_s: float) -> None:
         file.write(line + b"\n")
         file.flush()
         os.fsync(file.fileno())
-    folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    sync(directory)
 
 
 def read_ledger(directory: Path) -> list[Issued]:

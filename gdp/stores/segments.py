@@ -16,7 +16,7 @@ from typing import Final
 
 from gdp.closing import ClosedOnExit
 from gdp.errors import StoreError
-from gdp.stores.files import private, write_all
+from gdp.stores.files import private, sync, write_all
 
 SEGMENT_BYTES: Final = 64 << 20  # after which the next checkpoint begins a file
 SUFFIX: Final = ".records"
@@ -199,10 +199,11 @@ class Segments(ClosedOnExit):
         self._sizes[self.last] = end - self.last
 
     def drop(self, offset: int) -> None:
-        """Remove the file that begins at an offset."""
+        """Remove the file that begins at an offset, also on the disk: a power cut brings back none before a gap."""
         if offset == self.last:
             self.close()
         self._path(offset).unlink(missing_ok=True)
+        sync(self.folder)
         del self._sizes[offset]
         self.absent.discard(offset)
 
@@ -220,11 +221,8 @@ class Segments(ClosedOnExit):
         flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
         self._last = os.open(self._path(offset), flags, 0o600)
         self._sizes[offset] = 0
-        folder = os.open(self.folder, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        os.fsync(self._last)  # empty before its name is there: without a journal, the name may lead to a dropped file
+        sync(self.folder)
 
     def _handle(self) -> int:
         if self._last is None:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 from gdp.closing import ClosedOnExit
 from gdp.errors import LocalError
+from gdp.stores.files import sync
 from proxy.endpoints.core.endpoint import Origin
 from proxy.recordings.mcap_writer import CHUNK_BYTES, McapWriter
 from proxy.serial.bounded_cache import digest_of
@@ -65,7 +66,7 @@ class BagWriter(ClosedOnExit):
                 _Ros1Format(self.partial) if ros == 1 else McapWriter(self.partial.open("xb", buffering=0))
             )
             fcntl.flock(self._format.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            _sync(self.path.parent)
+            sync(self.path.parent)
         except OSError as error:
             raise LocalError(f"{self.path} cannot be made: {error.strerror}") from error
         self._handles: dict[tuple[object, ...], int] = {}  # by the properties that the format can distinguish
@@ -147,10 +148,10 @@ class BagWriter(ClosedOnExit):
         self.is_closed = True
         try:
             self._format.finish()
-            _sync(self.partial)
+            sync(self.partial)
             _refuse_existing(self.path)
             self.partial.rename(self.path)
-            _sync(self.path.parent)
+            sync(self.path.parent)
         except OSError as error:
             why = f"{self.path} cannot be written: {error.strerror}"
             raise LocalError(
@@ -261,15 +262,6 @@ def _put_aside(partial: Path) -> None:
         place = next(each for each in places if not each.exists() and not each.with_suffix("").exists())
         partial.rename(place)
     log.warning("a run that was killed left a recording: gdp recording finish %s", place)
-
-
-def _sync(path: Path) -> None:
-    """Put a file or the names in a folder on the disk; raises ``OSError`` where that fails."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _reporter(channel: Channel) -> tuple[object, ...]:

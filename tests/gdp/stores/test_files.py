@@ -38,7 +38,8 @@ def test_a_private_file_is_private_from_its_first_byte_on(tmp_path: Path, monkey
     genuine = os.fsync
 
     def watching(handle: int) -> None:
-        seen.append(stat.S_IMODE(os.fstat(handle).st_mode))
+        if stat.S_ISREG(mode := os.fstat(handle).st_mode):
+            seen.append(stat.S_IMODE(mode))
         genuine(handle)
 
     monkeypatch.setattr(os, "fsync", watching)
