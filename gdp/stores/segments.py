@@ -227,6 +227,7 @@ class Segments(ClosedOnExit):
         flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
         self._last = os.open(self._path(offset), flags, 0o600)
         self._set(offset, 0)
+        os.fsync(self._last)  # empty before its name is there: without a journal, the name may lead to a dropped file
         sync(self.folder)
 
     def _handle(self) -> int:
