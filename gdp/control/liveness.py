@@ -99,8 +99,6 @@ class LivenessMonitor:
     def note_alive(self, neighbour: Neighbour, heard_s: float) -> None:
         """Note when a valid frame of a neighbour came."""
         neighbour.heard_s, neighbour.lateness_s = heard_s, self._lateness_s
-        if neighbour.let_go_s != -NEVER_S:  # what a revoked one has sent before does not keep it
-            neighbour.let_go_s = None
 
     def multiplier(self, timing: Timing, now_s: float) -> int:
         """Return how many keepalives of ours may be missing, as slow as this node is at present."""
@@ -112,8 +110,8 @@ class LivenessMonitor:
 
     def gone_at_s(self, neighbour: Neighbour) -> float:
         """Return when a neighbour is lost if it stays silent; the node's own lateness does not count as silence."""
-        if neighbour.let_go_s is not None:
-            return neighbour.let_go_s
+        if neighbour.is_let_go:  # whatever it has sent meanwhile
+            return -NEVER_S
         late_s = self._lateness_s - neighbour.lateness_s
         session = neighbour.keepalives
         if session is None or not session.is_alive:

@@ -84,8 +84,7 @@ class Neighbour:
     lateness_s: float = 0.0  # of this node, in all, when the neighbour was last heard
     incarnation_id: bytes = bytes(INCARNATION_BYTES)
     proof: tuple[bytes, bytes] | None = None  # of a RIB that is attached here: its membership, its RtCert for us
-    # it is removed then: an older node has its identity, unless a frame comes before; or its membership was revoked
-    let_go_s: float | None = None
+    is_let_go: bool = False  # it is removed at once: its membership was revoked, or an older node has its identity
     refuses_us: bool = False  # its last hello reported that an older node has our identity
     is_proven: bool = False  # its present session has echoed our nonce: it is on this link now
     cookie: bytes = b""  # received from it: it verifies strangers' hellos with one only

@@ -311,15 +311,13 @@ class HelloProtocol:
                 try:
                     self._policy.check_member(member, now.unix_s)
                 except StatementError:
-                    self._next_s = None
-                    neighbour.let_go_s = -NEVER_S
+                    self._next_s, neighbour.is_let_go = None, True
 
     def schedule_removal(self, neighbour: Neighbour, now_s: float) -> None:
         """Have ``drop_silent`` remove a neighbour, because an older node with its identity is alive."""
-        self._next_s = None
         self.conflicts.record_refusal(neighbour.name, neighbour.incarnation_id, now_s)
         self._tell_conflict(neighbour.port, neighbour.nonce, neighbour.name, now_s)
-        neighbour.let_go_s = now_s
+        self._next_s, neighbour.is_let_go = None, True
 
     def tell_conflicts(self, name: Name, now_s: float) -> None:
         """Notify a neighbour, if it is one, that another node has its identity."""

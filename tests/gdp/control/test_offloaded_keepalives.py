@@ -194,9 +194,10 @@ def test_what_the_data_plane_refused_is_counted() -> None:
     assert pair.ends["a"].drops[DropReason.REPLAYED] == 1
 
 
+@pytest.mark.parametrize("is_revoked", [True, False])
 @pytest.mark.parametrize("is_offloaded", [True, False])
-def test_what_a_revoked_neighbour_has_just_sent_does_not_keep_it(
-    monkeypatch: pytest.MonkeyPatch, *, is_offloaded: bool
+def test_what_a_neighbour_that_is_to_be_removed_has_just_sent_does_not_keep_it(
+    monkeypatch: pytest.MonkeyPatch, *, is_offloaded: bool, is_revoked: bool
 ) -> None:
     policy = Policy(SCHOOL.root)
     monkeypatch.setattr("tests.gdp.control.test_keepalive.POLICY", policy)
@@ -210,9 +211,12 @@ def test_what_a_revoked_neighbour_has_just_sent_does_not_keep_it(
         pair._report(is_over=True)
     now = at(pair.now_s, UNIX_S + pair.now_s)
     neighbour.checked_s = pair.now_s
-    wire = Revocation.make(SCHOOL.key, issuer, fingerprint, YEAR.not_after_unix_s)
-    policy.revoked.receive_revocation(parse(wire), OPERATOR, now, lambda _: True)
-    end.recheck(fingerprint, now)
+    if is_revoked:
+        wire = Revocation.make(SCHOOL.key, issuer, fingerprint, YEAR.not_after_unix_s)
+        policy.revoked.receive_revocation(parse(wire), OPERATOR, now, lambda _: True)
+        end.recheck(fingerprint, now)
+    else:  # an older node has its identity
+        end.schedule_removal(neighbour, pair.now_s)
     if is_offloaded:
         session.taken, session.heard_s = session.taken + 1, pair.now_s
         pair._report(is_over=False)
