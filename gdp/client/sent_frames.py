@@ -196,6 +196,7 @@ class SentFrames:
         is_unproven = False
         reader, path = self._readers.get(name), self._paths.get(name)
         if path is not None:
+            path.controller.model.add_wait(waited_s)
             if hops is not None:
                 path.handle_hops(hops, now_s)
             if reader is not None and acknack.received:

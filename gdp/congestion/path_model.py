@@ -14,6 +14,7 @@ FIRST_RTT_S: Final = 0.02  # until one is measured
 NOISE_S: Final = 0.002
 _STANDING_REPORTS: Final = 4  # that all show a queue, where the empty path is shorter than that noise
 _HOLD_WINDOW_S, _HOLD_MOST_S = 0.2, 0.01  # of reports; a reader reports at least each 20 ms while frames come
+_LATE_KEPT: Final = 31 / 32  # from report to report
 BASE_WINDOW_S: Final = 10.0  # Copa, section 2
 _RATE_ROUNDS: Final = 10
 _RECENT_ROUNDS: Final = 2
@@ -56,6 +57,7 @@ class PathModel:
         queue_s: standing queue, in seconds.
         highest_s: highest round trip of the last four; 0: none.
         hold_s: how long the reader holds back reports.
+        late_s: how long reports wait here for this program, as it was in the last few dozen; 0: it reads at once.
         bytes_s: highest delivery rate of the last rounds; 0 before the first one.
         recent_bytes_s, peak_bytes_s, last_bytes_s: that of two rounds and of a minute, and the last one.
         capacity_bytes_s: highest rate of the last minute while more waited to be sent; None: nothing waited yet.
@@ -64,7 +66,7 @@ class PathModel:
     """
 
     def __init__(self) -> None:
-        self.loss = 0.0
+        self.loss = self.late_s = 0.0
         self.is_hidden = False
         self.reset()
 
@@ -113,6 +115,10 @@ class PathModel:
         """Add how long the oldest frame of a report had waited for it."""
         hold_s = hold_s if hold_s < _HOLD_MOST_S else _HOLD_MOST_S
         self.hold_s = self._hold.add(now_s, hold_s, now_s - _HOLD_WINDOW_S)
+
+    def add_wait(self, waited_s: float) -> None:
+        """Add how long a report waited for this program."""
+        self.late_s = max(waited_s, _LATE_KEPT * self.late_s)
 
     def add_rate(self, rate: float, at_round: int, now_s: float, *, is_full: bool) -> None:
         """Add a delivery rate; ``is_full``: the window was used, and more waited."""

@@ -11,6 +11,7 @@ them stands in a queue.
   and lowers the rate to what the growth of the queue shows.
 - **Increase.** Below the rate at which a queue grew last it returns fast. Above it, it tries a little more now
   and then, and more while nothing else is sent.
+- **Busy machines.** A delay is no queue while reports wait so long for this program; what such a delay taught is void.
 - **Starvation.** A frame may leave each ``DELAY_MOST_S``, else nothing would be measured.
 """
 
@@ -93,13 +94,14 @@ class ScavengingController(PathController):
         self._bytes_s, self._ceiling = 0.0, float("inf")
         self._unseen_s = self._reduced_s = self._tried_s = self._raised_s = self._begun_s = float("-inf")
         self._begun_charged = self._begun_others = 0
-        self._try, self._proven = _TRY, 0.0
+        self._try, self._proven, self._grown_s = _TRY, 0.0, float("inf")
 
     def _set_limits(self) -> None:
         model, least = self.model, float(_LEAST_FRAMES * self._mtu)
         if model.rtt_s is not None and not self._bytes_s:
             self._bytes_s = least / model.rtt_s
-        ahead = 0.0 if model.rtt_s is None else _AHEAD * self._bytes_s * (model.base_rtt_s + REPORT_DELAY_S)
+        trip_s = model.base_rtt_s + REPORT_DELAY_S + 2 * model.late_s  # the reader's program may be as late
+        ahead = 0.0 if model.rtt_s is None else _AHEAD * self._bytes_s * trip_s
         self.window = self.limit = max(ahead, least)
         self.pace.set_rate(self._bytes_s or float("inf"), model.rtt_s or 0.0)
 
@@ -124,7 +126,8 @@ class ScavengingController(PathController):
     def _adapt(self, size: int, newest: Flight, now_s: float) -> None:
         del size
         model = self.model
-        if newest.sent_s <= self._unseen_s or model.queue_s * self._bytes_s <= self._mtu:
+        bytes_s, noise = self._bytes_s, max(model.late_s * self._bytes_s, self._mtu)
+        if newest.sent_s <= self._unseen_s or model.queue_s * bytes_s <= noise:
             return
         queue_s, grew_s = model.standing_s - model.base_rtt_s, max(_TRIPS * model.base_rtt_s, REPORT_DELAY_S)
         if self._raised_s > self._reduced_s:
@@ -140,6 +143,7 @@ class ScavengingController(PathController):
         is_reached = self._bytes_s >= _REACHED * self._ceiling or self._ceiling == float("inf")
         self._ceiling = carried if is_reached else (self._ceiling + carried) / 2
         self._bytes_s, self._try, self._proven = max(_SHARE * carried, self._mtu / DELAY_MOST_S), _TRY, 0.0
+        self._grown_s = self.model.queue_s
         self._unseen_s = self._reduced_s = self._tried_s = now_s
         self._begin(now_s)
         self._signal(Signal.PATH_FULL, now_s)
@@ -166,6 +170,8 @@ class ScavengingController(PathController):
 
     def _grow(self, charged_s: float, seen_s: float, now_s: float, *, is_alone: bool) -> None:
         """Raise the rate; ``charged_s``: bytes of all frames a second, ``seen_s``: for how long this one was tried."""
+        if self._grown_s < self.model.late_s:
+            self._ceiling = float("inf")  # that queue may have been a program's wait
         below, before, is_new = _SHARE * self._ceiling, self._bytes_s, self._ceiling == float("inf")
         # next to others a round trip of too much makes no more queue than the noise of programs
         more = self._try if is_alone else min(max(NOISE_S / self.model.base_rtt_s, _TRY_LEAST), _TRY)
@@ -184,4 +190,4 @@ class ScavengingController(PathController):
     def _shows_s(self, excess: float) -> float:
         """Return after which time frames that leave too fast by this share make a queue that shows."""
         model = self.model
-        return (model.empty_path_s - model.base_rtt_s + self._mtu / self._bytes_s) / excess
+        return (model.empty_path_s - model.base_rtt_s + max(self._mtu / self._bytes_s, model.late_s)) / excess

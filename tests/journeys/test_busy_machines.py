@@ -1,4 +1,4 @@
-"""Images over a fast path between machines whose programs wait for a processor: these waits are no congestion."""
+"""Fast paths between machines whose programs wait for a processor: these waits are no congestion."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from functools import partial
 import pytest
 
 from gdp.client.participant import Participant
+from gdp.client.send_options import SendOptions
 from gdp.frame.codec import ETHER_BYTES, Kind, decode
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from lab.network import SimNetwork
@@ -29,14 +30,21 @@ class Program:
     Args:
         wait_s: shortest and longest wait.
         hidden_s: up to so much of it is in the kernel, or before a report leaves, where no clock of an end sees it.
+        seed: of the waits.
     """
 
     def __init__(
-        self, member: Participant, network: SimNetwork, label: str, wait_s: tuple[float, float], hidden_s: float
+        self,
+        member: Participant,
+        network: SimNetwork,
+        label: str,
+        wait_s: tuple[float, float],
+        hidden_s: float,
+        seed: int = 0,
     ) -> None:
         self._member, self._network, self._label = member, network, label
         self._wait_s, self._hidden_s = wait_s, hidden_s
-        self._random = random.Random(label)
+        self._random = random.Random(f"{label} {seed}" if seed else label)
         self._came: list[tuple[float, ReceivedFrame]] = []
         self._free_s = 0.0
 
@@ -123,3 +131,27 @@ def test_an_image_does_not_wait_for_reports_that_wait_for_a_processor(
     took_s = [left_s[number] - at_s for number, at_s in zip(sorted(left_s), begun_s, strict=True)]
     late = [each for each in took_s[FIRST:] if each > 1.25 * IMAGE_BYTES / BYTES_S]
     assert len(late) <= (COUNT - FIRST) // 10, late
+
+
+@pytest.mark.momentary("what is tried is how fast what may wait leaves")
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("wait_s", "hidden_s", "least_bytes_s"),
+    [((0.0001, 0.003), 0.003, 20e6), ((0.0001, 0.02), 0.005, 2e6), ((0.002, 0.04), 0.012, 0.5e6)],
+)
+def test_what_may_wait_does_not_take_waits_for_a_processor_for_a_queue(
+    wait_s: tuple[float, float], hidden_s: float, least_bytes_s: float, seed: int
+) -> None:
+    world = Simulation(topology=PAIR, keepalive_ms=None)
+    network = world.network
+    for link in (*world.cables.values(), *world.leads.values()):
+        link.delay_s = 0.00002
+    for label in (SENDER, READER):
+        network.replace(label, Program(world.members[label], network, label, wait_s, hidden_s, seed))
+    assert world.run_until_attached()
+    flow = advertise(world, "/history", SENDER, options=SendOptions(priority="background"))
+    flow.read_by(READER)
+    assert network.run(5, lambda: flow.is_read_by(1))
+    for number in range(200):
+        flow.publish(number.to_bytes(4, "big") + bytes(40_000))
+    assert network.run(8e6 / least_bytes_s, lambda: flow.has(READER, 200))
