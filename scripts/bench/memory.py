@@ -6,6 +6,7 @@ and down at the same seconds, would have carried the same bytes. Ingest is in pr
 
 .venv/bin/python scripts/bench/memory.py
 .venv/bin/python scripts/bench/memory.py --quick --no-save
+sudo .venv/bin/python scripts/bench/memory.py --real --seconds 600 --no-save
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 sys.path.append(str(ROOT))
+
+import memory_live
 
 from gdp.capsule.audit import Audit
 from gdp.capsule.chain import Chain, ChainWriter
@@ -256,8 +259,28 @@ def damages(options: Options, keeping: Keeping, over: Rounds) -> None:
     over.add("ours", "audit", "share of damages named", named / options.drawn)
 
 
+def measure_real(options: Options) -> Outcome:
+    """Measure real processes."""
+    over = Rounds()
+    progress("history")
+    memory_live.history(options, over, ideal_s)
+    for keeps in (False, True):
+        progress("live traffic")
+        memory_live.live(options, over, keeps=keeps)
+    case, uploads, without = memory_live.CASE, "while it uploads", "without"
+    targets = [
+        over.target("time / what the bytes need", "ours", case, "time / what the bytes need", 1.2, at_most=True),
+        over.target("equal byte for byte", "ours", case, "equal byte for byte", 1),
+        over.difference("live cmd_vel p99, ms more", uploads, without, case, "cmd_vel p99, ms", 5),
+        over.ratio("live image age", uploads, without, case, "image age p50, ms", 1.1, at_most=True),
+    ]
+    return Outcome("memory", "A robot's history, on real processes", over, targets, {"seconds": options.seconds})
+
+
 def measure(options: Options) -> Outcome:
     """Measure all rows."""
+    if options.real:
+        return measure_real(options)
     over = Rounds()
     with (
         tempfile.TemporaryDirectory(prefix="gdp-memory-", dir="/dev/shm") as text,
@@ -301,5 +324,7 @@ if __name__ == "__main__":
         ("drawn", 1_000, "damages"),
     ):
         parser.add_argument(f"--{name}", type=type(value), default=value, help=f"{text} (default: %(default)s)")
+    parser.add_argument("--real", action="store_true", help="real processes in real time: name 600 seconds; needs root")
+    parser.set_defaults(is_whole=lambda options: not options.real)
     parser.add_argument("--disk", type=Path, default=ROOT, help="folder of the holder (default: %(default)s)")
     run_bench(parser, measure)
