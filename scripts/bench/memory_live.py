@@ -81,7 +81,7 @@ def export() -> None:
             return HolderAnswer.from_cbor(session.call("store", request.to_cbor(), replication=1).payload)
 
         (about,) = ask(HolderRequest(ask=Ask.LIST, topic=topic.name)).descriptors
-        reader, found = CapsuleReader(about, topic.secrets), list[str]()
+        reader, found = CapsuleReader(about, {topic.name: topic.secrets}), list[str]()
         while not reader.is_done:
             for kept in reader.handle_response(ask(reader.next_request())):
                 found.append(hashlib.sha256(read_message(kept.message)[1]).hexdigest())
