@@ -28,6 +28,7 @@ needs_wireguard = pytest.mark.skipif(
         ["own_pace.py", "--quick", "--no-save"],
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         pytest.param(["ros.py", "--calls", "--quick", "--no-save"], marks=needs_ros2),
+        pytest.param(["tunnel.py", "--quick", "--no-save"], marks=needs_wireguard),
         ["survive.py", "--only", "cut", "--rounds", "1", "--no-save"],
     ],
     ids=lambda command: command[0],

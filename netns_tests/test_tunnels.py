@@ -18,6 +18,7 @@ import pytest
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
+from gdp.limits import FLIGHT_MAX_BYTES
 from gdp.ports.tunnel import uapi
 from gdp.ports.tunnel.devices import find_device
 from gdp.ports.tunnel.path_mtu import RouteMonitor, route_mtu
@@ -502,3 +503,25 @@ def test_numbered_frames_arrive_once_and_in_order(sites: tuple[Site, Site], ends
     arrived: list[int] = []
     until(lambda: arrived.extend(number for number in numbers(two) if number) or len(arrived) >= 200, *ends)  # type: ignore[func-returns-value]
     assert arrived == list(range(1, 201))
+
+
+def test_a_whole_window_waits_while_wireguard_go_has_no_processor(sites: tuple[Site, Site], ends: Ends) -> None:
+    def dropped() -> int:
+        """Return for how many packets the WireGuard device of the first site had no space; proc_net_dev(5)."""
+        with sites[0].entered():
+            text = Path("/proc/thread-self/net/dev").read_text()
+        return int(next(line for line in text.splitlines() if sites[0].ifname in line).partition(":")[2].split()[11])
+
+    sender, window = sites[0].frames(), FLIGHT_MAX_BYTES // 1_250
+    until(crosses(sender, sites[1].frames()), *ends)
+    pid = process_of(sites[0].ifname)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        for number in range(window):
+            sender.send(payload(number))
+        assert dropped() == 0
+        for number in range(window):
+            sender.send(payload(number))
+        assert dropped() > 0  # the bound of the queue
+    finally:
+        os.kill(pid, signal.SIGCONT)

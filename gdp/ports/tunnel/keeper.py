@@ -31,6 +31,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.intervals import ATTACH_S, LOOK_S, STEADY_S, UPKEEP_S
+from gdp.limits import FLIGHT_MAX_BYTES
 from gdp.ports.confine.system import prctl
 from gdp.ports.netlink import LINK_GROUP, Notifications, RefusedError
 from gdp.ports.readiness import readable
@@ -59,10 +60,9 @@ _TUNSETIFF: Final = 0x400454CA
 _IFREQ: Final = struct.Struct("16sH22x")
 _IFF_TUN, _IFF_NO_PI, _IFF_VNET_HDR = 0x1, 0x1000, 0x4000
 _TUN_PI, _TUN_VNET_HDR = 4, 5  # IFLA_TUN_PI, IFLA_TUN_VNET_HDR
-_DEATH_SIGNAL: Final = 1  # PR_SET_PDEATHSIG
-_NO_NEW_PRIVS: Final = 38
+_DEATH_SIGNAL, _NO_NEW_PRIVS = 1, 38  # PR_SET_PDEATHSIG, PR_SET_NO_NEW_PRIVS
 _END_S: Final = 0.3
-_QUEUE_PACKETS: Final = 1_000  # as Ethernet devices; the 500 of TUN devices overflow in a burst of one window
+_QUEUE_PACKETS: Final = FLIGHT_MAX_BYTES // 1_024  # a whole window while wireguard-go waits for a processor
 _RESTART_MIN_S, _RESTART_MAX_S = 0.1, 5.0
 _SAID_MAX_BYTES: Final = 4096
 _INSTALL: Final = "modprobe wireguard, or apt-get install --no-install-recommends wireguard-go"
