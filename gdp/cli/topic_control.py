@@ -15,6 +15,7 @@ from gdp.cli import options
 from gdp.cli.local_nodes import Node, connect, find_name
 from gdp.cli.output import show, table
 from gdp.cli.program import Program
+from gdp.control import topic_control as control
 from gdp.errors import LocalError
 from gdp.intervals import ANSWER_S
 from gdp.management.control_client import NodeConnection
@@ -23,8 +24,6 @@ from gdp.terminal import echo
 app = Program("gdp control", no_args_is_help=True, help="Control of a topic that one publisher at a time may steer.")
 
 _REFUSED: Final = 1
-_ASK: Final = "control"
-_REPLY_BYTES: Final = 1_024
 _COLUMNS: Final = ("at", "state", "holder", "refused")
 
 NameText = Annotated[
@@ -52,7 +51,7 @@ def take(
     """
     with connect(node) as connection:
         readers = _Readers.find(connection, name)
-        _print(readers.act("take", force=force, at=time.time_ns()), as_json=as_json)
+        _print(readers.act(control.TAKE, force=force, at=time.time_ns()), as_json=as_json)
 
 
 @app.command(no_args_is_help=True, epilog="Examples: gdp control give /cmd_vel desk2; gdp control give /cmd_vel")
@@ -67,7 +66,7 @@ def give(
     The holder may do so, and the machine that reads the topic.
     """
     with connect(node) as connection:
-        _print(_Readers.find(connection, name).act("give", to=to), as_json=as_json)
+        _print(_Readers.find(connection, name).act(control.GIVE, to=to), as_json=as_json)
 
 
 class _Readers(NamedTuple):
@@ -85,28 +84,24 @@ class _Readers(NamedTuple):
         asked = dict.fromkeys([*peers, str(connection.status().get("name"))])
         readers = cls(connection, name, {})._ask({target: {} for target in asked})
         if not readers.answers:
-            raise LocalError(
-                f"{text}: no reader that answers has it under exclusive control; does a node read it there,"
-                " and has the rule 'control: exclusive'?"
-            )
+            raise LocalError(f"{text}: {control.NO_READER}")
         return readers
 
     def act(self, act: str, **arguments: object) -> _Readers:
         """Ask each reader to act on what it has just said, and return the answers."""
-        return self._ask(
-            {target: {"do": act, "seen": answer["generation"], **arguments} for target, answer in self.answers.items()}
-        )
+        answers = self.answers.items()
+        return self._ask({target: control.request(act, answer, **arguments) for target, answer in answers})
 
     def _ask(self, bodies: Mapping[str, Mapping[str, object]]) -> _Readers:
-        common = {"name": self.name, "timeout_s": ANSWER_S, "reply_bytes": _REPLY_BYTES}
-        requests = [(_ASK, {**common, "target": target, "body": body}) for target, body in bodies.items()]
+        common = {"name": self.name, "timeout_s": ANSWER_S, "reply_bytes": control.REPLY_BYTES}
+        requests = [(control.ASK, {**common, "target": target, "body": body}) for target, body in bodies.items()]
         answers = dict(self.answers)
         for target, reply in zip(bodies, self.connection.ask_all(requests), strict=True):
             result = reply.get("result")
-            if isinstance(result, Mapping) and "state" in result:
+            if isinstance(result, Mapping) and control.has_control(result):
                 answers[target] = {"at": reply.get("label"), **result}
             elif target in answers:
-                answers[target] = {**answers[target], "error": reply.get("error") or "no answer: it may have been done"}
+                answers[target] = {**answers[target], "error": reply.get("error") or control.NO_ANSWER}
         return self._replace(answers=answers)
 
 

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Final
 
 from gdp.control.diagnostics import Reply
+from gdp.control.topic_control import ASK, NO_ANSWER, NO_READER, REPLY_BYTES, SHOW, has_control, request
 from gdp.errors import LocalError
 from gdp.intervals import ANSWER_S
 from gdp.names import Name
@@ -29,13 +30,6 @@ from proxy.serial.channel import RosVersion
 
 log = logging.getLogger(__name__)
 
-ASK: Final = "control"
-TAKE, GIVE, SHOW = "take", "give", "show"
-_REPLY_BYTES: Final = 1_024
-NO_READER: Final = (
-    "no reader that answers has it under exclusive control; does a node read it there, and has the rule"
-    " 'control: exclusive'?"
-)
 _CDR_BYTES: Final = 4  # encapsulation; a boolean before a length has three bytes of padding
 
 _Replies = Mapping[Name, Reply | None]
@@ -101,7 +95,7 @@ class ControlServices:
             try:
                 self._context.member.diagnostics.ask(
                     reader, ASK, now=now, on_reply=on_reply, name=self._flow_spec.name, body=body, timeout_s=ANSWER_S,
-                    reply_bytes=_REPLY_BYTES,
+                    reply_bytes=REPLY_BYTES,
                 )  # fmt: skip
             except LocalError as error:
                 log.warning("a reader is not asked for control reader=%s reason=%s", reader.short, error)
@@ -110,12 +104,12 @@ class ControlServices:
     def _act(self, event: RequestReceived, replies: _Replies, now_s: float) -> None:
         """Ask the readers that have the topic under control to act on what they have said."""
         act = self._acts.get(event.handle, SHOW)
-        found = {reader: reply for reader, reply in replies.items() if reply and "state" in reply.result}
+        found = {reader: reply for reader, reply in replies.items() if reply and has_control(reply.result)}
         if act == SHOW or not found:
             self._respond(event, found, now_s)
             return
-        asked = {"do": act, "at": time.time_ns()}
-        bodies = {reader: {**asked, "seen": reply.result.get("generation")} for reader, reply in found.items()}
+        at = time.time_ns()
+        bodies = {reader: request(act, reply.result, at=at) for reader, reply in found.items()}
         self._ask(bodies, now_s, partial(self._respond, event))
 
     def _respond(self, event: RequestReceived, replies: _Replies, _now_s: float) -> None:
@@ -133,8 +127,8 @@ class ControlServices:
 def _said(reader: Name, reply: Reply | None, own: bytes | None) -> tuple[bool, str]:
     """Return whether a reader did what was asked, or names ``own`` as the holder, and what it says."""
     result = {} if reply is None else reply.result
-    if reply is None or "state" not in result:
-        return False, f"{reader.short}: no answer: it may have been done"
+    if reply is None or not has_control(result):
+        return False, f"{reader.short}: {NO_ANSWER}"
     holder, error = result.get("holder"), result.get("error")
     state = f"{result['state']} by {holder}" if holder else result["state"]
     return not error if own is None else result.get("peer") == own, f"{reply.member.label}: {error or state}"

@@ -12,13 +12,14 @@ from collections.abc import Sequence
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import is_urgent
+from gdp.control.topic_control import GIVE, SHOW, TAKE
 from gdp.errors import LocalError
 from gdp.intervals import READER
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.control_services import GIVE, SHOW, TAKE, ControlServices
+from proxy.bridge.control_services import ControlServices
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.encoder import MessageEncoder, description_of
 from proxy.bridge.core.reduction import adaptation_of, encoders_of

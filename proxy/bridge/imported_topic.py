@@ -16,6 +16,7 @@ from typing import NamedTuple
 from gdp.capsule.late_join import LateJoin
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Message, Topic
+from gdp.control.topic_control import GIVE
 from gdp.due_queue import earliest
 from gdp.errors import DropReason, LocalError, RemoteError
 from gdp.extras import MissingExtraError
@@ -24,7 +25,7 @@ from gdp.message.loss import Losses
 from gdp.names import Name
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.control_services import GIVE, ControlServices
+from proxy.bridge.control_services import ControlServices
 from proxy.bridge.core.decoder import MessageDecoder, differences_of
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.core.exclusive_control import ExclusiveControl

@@ -12,13 +12,13 @@ from collections.abc import Mapping
 from typing import Final
 
 from gdp.control.diagnostics import Question
-from gdp.crypto.schema import FLAG, Keyed, text, uint
+from gdp.control.topic_control import ACT, ASK, AT, FORCE, GIVE, SEEN, SHOW, TAKE, TO
+from gdp.crypto.schema import Keyed, text
 from gdp.errors import LocalError, StoreError
 from gdp.limits import MARK_MAX_CHARS
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.control_services import ASK, GIVE, SHOW, TAKE
 from proxy.bridge.core.exclusive_control import ExclusiveControl
 from proxy.bridge.faults import Fault
 from proxy.bridge.flow_rows import control_row
@@ -29,12 +29,6 @@ log = logging.getLogger(__name__)
 
 MARK: Final = "mark"
 _NAME: Final = Keyed("mark", text(MARK_MAX_CHARS))
-_LABEL_MAX_CHARS: Final = 256
-_ACT: Final = Keyed("do", text(8), absent=SHOW)
-_AT: Final = Keyed("at", uint(), absent=0)  # the asker's wall clock, Unix nanoseconds
-_FORCE: Final = Keyed("force", FLAG, absent=False)
-_SEEN: Final = Keyed("seen", uint(), absent=0)  # generation
-_TO: Final = Keyed("to", text(_LABEL_MAX_CHARS), absent="")  # label of a publisher; empty: none gets it
 
 
 def answer_control(state: ProxyState, bridge: Bridge) -> None:
@@ -46,7 +40,7 @@ def answer_control(state: ProxyState, bridge: Bridge) -> None:
             return {}
         flow, control = found
         error = ""
-        if (act := _ACT.read(question.body)) != SHOW:
+        if (act := ACT.read(question.body)) != SHOW:
             try:
                 _act(act, flow, control, question, now.mono_s, state.identity.name)
             except LocalError as refused:
@@ -74,16 +68,16 @@ def answer_mark(state: ProxyState, question: Question, now: Timestamps) -> Mappi
 def _act(act: str, flow: ImportedTopic, control: ExclusiveControl, question: Question, now_s: float, own: Name) -> None:
     """Take or give control, where the asker may. Raises ``LocalError``: it may not."""
     asker, body = question.asker.name, question.body
-    if _SEEN.read(body) != control.generation:
+    if SEEN.read(body) != control.generation:
         raise LocalError("control has changed meanwhile; look who holds it, and ask again")
     if act == TAKE:
         if asker not in flow.publishers:
             raise LocalError("only a publisher of the topic may take its control, and none of this node is known here")
-        control.take(asker, now_s, since_ns=_AT.read(body), force=_FORCE.read(body))
+        control.take(asker, now_s, since_ns=AT.read(body), force=FORCE.read(body))
     elif act == GIVE:
         if asker not in (control.holder, own):
             raise LocalError("only who holds control may give it; take it with 'gdp control take'")
-        control.give(_publisher(flow, _TO.read(body)), now_s)
+        control.give(_publisher(flow, TO.read(body)), now_s)
     else:
         raise LocalError("control may be shown, taken or given; this version knows no more")
 

@@ -11,6 +11,7 @@ from typing import Final, cast
 import pytest
 
 from gdp.control.diagnostics import Question, Reply
+from gdp.control.topic_control import NO_READER
 from gdp.errors import DropReason
 from gdp.message.clock_offset import ClockEstimate
 from gdp.metadata import Metadata
@@ -377,7 +378,7 @@ def test_who_lost_the_right_to_publish_takes_nothing_by_a_service(clocked: Drive
 def test_a_topic_without_a_reader_under_control_and_a_silent_reader_are_named(clocked: Drive) -> None:
     clocked.sites.reload(clocked.robot, imports=[DRIVE])
     clocked.sites.run(2)
-    assert clocked.call(SERVER, "take") == (False, control_services.NO_READER)
+    assert clocked.call(SERVER, "take") == (False, NO_READER)
     asked: list[str] = []
 
     def only_show(question: Question, now: Timestamps) -> Mapping[str, object] | None:
