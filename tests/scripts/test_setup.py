@@ -57,7 +57,7 @@ def clone(tmp_path: Path) -> Clone:
     (tmp_path / "scripts").mkdir()
     text = (ROOT / "scripts" / "setup.sh").read_text()
     (tmp_path / "scripts" / "setup.sh").write_text(text)
-    stubs = {f"bin/{tool}": "#!/bin/bash\n" for tool in re.findall(r"command -v ([a-z][\w-]+)", text)}
+    stubs = {f"bin/{tool}": "#!/bin/bash\n" for tool in re.findall(r"command -v ([a-z][\w.-]+)", text)}
     stubs |= {f"bin/{tool}": "#!/bin/bash\n" for tool in ("nsenter", "setpriv", "unshare", "zsh", "fish")}
     stubs |= {f"scripts/{name}.sh": "#!/bin/bash\n" for name in ("setup_ros1", "setup_cloud_schema")}
     stubs |= {"bin/apt-get": '#!/bin/bash\necho "apt-get $*" >&2; exit 1\n', "bin/python3": PYTHON}
