@@ -305,8 +305,7 @@ def _print(row: Mapping[str, object], *, json: bool) -> None:
     if json:
         echo(json_text.dumps(row))
         return
-    shown = [f"{key} {','.join(_short(value)) if key in _NAMES else value}" for key, value in row.items()]
-    echo("  ".join(shown))
+    echo("  ".join(f"{key} {','.join(_short(value)) if key in _NAMES else value}" for key, value in row.items()))
 
 
 def _short(names: object) -> list[str]:

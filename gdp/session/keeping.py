@@ -282,7 +282,6 @@ class KeptCapsule:
         self._seal_recorded()
         if self.ring.next or any(each.type is RecordType.MESSAGE for each in self._waiting):
             self.finish(time_ns)
-        self._waiting.clear()
         self.is_superseded = True
 
     def _seal_recorded(self) -> None:
@@ -393,9 +392,11 @@ class CapsuleKeeper:
         kept = self._by_folder[folder] = KeptCapsule(ring, self._identity, holders, around_ns)
         for old in ring.older(self.ended):
             self.ended[old.descriptor.name] = KeptCapsule(old, self._identity, holders, around_ns, is_superseded=True)
-        for name, publisher in {} if before is None else before.publishers.items():
-            kept.add(name, publisher)
-            self.topics[name] = kept
+        if before is not None:
+            for name, publisher in before.publishers.items():
+                kept.add(name, publisher)
+                self.topics[name] = kept
+            before.publishers = {}
         return kept
 
     def client(self, holder: Topic) -> ClientCore:
@@ -450,7 +451,7 @@ class CapsuleKeeper:
 
     def flush(self, unix_s: float) -> None:
         """Append what was published so far, for ``is_uploaded``."""
-        for kept in self._by_folder.values():
+        for kept in self.capsules:
             kept.flush(int(unix_s * 1e9))
 
     @property

@@ -2,9 +2,8 @@
 
 I/O.
 A file appears under its name complete and synced, or not at all, so a kill in the middle leaves no partial file; its
-name is synced, too. A
-private file has mode 0600 from its first byte on. It is read and written only where no other user could have read or
-replaced it (``ownership``); a link in its place is not followed.
+name is synced, too. A private file has mode 0600 from its first byte on. It is read and written only where no other
+user could have read or replaced it (``ownership``); a link in its place is not followed.
 Each key folder has a ``.gitignore`` that covers all of it, also itself: Git reads one in every folder (gitignore(5)).
 """
 

@@ -126,7 +126,8 @@ class MergedPublisher:
     def publish(self, handle: int, raw: bytes, origin: Origin) -> None:
         """Publish one message by the virtual publisher, if its type is known."""
         del handle, origin
-        self.set_alive(True)
+        if self._handle is None:
+            self.set_alive(True)
         if self._handle is not None:
             self._dispatcher.endpoint.publish(self._handle, raw)
             self._kept.append(raw)

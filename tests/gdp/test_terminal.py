@@ -1,4 +1,4 @@
-"""Output of programs to a pipe: a node goes on while its pipe is not read, and what is missing there is counted."""
+"""Output of programs to a pipe: a node continues while its pipe is not read, and what is missing there is counted."""
 
 from __future__ import annotations
 

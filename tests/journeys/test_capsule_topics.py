@@ -149,6 +149,20 @@ def test_a_capsule_that_was_superseded_is_uploaded_by_the_next_process(tmp_path:
     assert [len(each.descriptor.topics) for each in readers] == [3, 4]
 
 
+def test_what_waits_for_a_slow_disk_is_kept_in_the_capsule_that_another_topic_ends(drive: Drive) -> None:
+    sent, before = publish(drive, drive.flows, 30, 7), drive.keeping.kept
+    before.ring._given_bytes += 1 << 30  # the disk is too slow
+    for number in range(3):
+        drive.flows[0].publish(b"%d" % number)
+    late = advertise(drive.flows[0].world, "/late")
+    drive.keeping.keep(late)
+    before.ring._given_bytes -= 1 << 30
+    assert drive.keeping.run(30, drive.holder, until=lambda: drive.keeping.keeper.is_uploaded)
+    found, readers = read(drive.holder, drive.flows)
+    assert found["/camera"] == [*sent["/camera"], b"0", b"1", b"2"]
+    assert not any(each.audit.findings or each.lost for each in readers)
+
+
 def test_a_mark_is_one_record_that_a_reader_of_any_topic_opens(drive: Drive) -> None:
     publish(drive, drive.flows, 12, 7)
     drive.keeping.kept.mark("bumped", int(drive.flows[0].world.network.now.unix_s * 1e9))
