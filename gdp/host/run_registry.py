@@ -261,8 +261,7 @@ def _take_down(record: Record, path: Path) -> bool:
     for name in record.files:
         target = Path(name)
         if target.is_dir() and not target.is_symlink():
-            with suppress(FileNotFoundError):  # another process removes it as well
-                shutil.rmtree(target)
+            shutil.rmtree(target, onerror=_unless_gone)
         else:
             target.unlink(missing_ok=True)
     path.with_suffix(_FRESH).unlink(missing_ok=True)
@@ -271,3 +270,9 @@ def _take_down(record: Record, path: Path) -> bool:
         with suppress(OSError):  # another run has a record there
             path.parent.rmdir()
     return True
+
+
+def _unless_gone(_function: object, _path: str, failure: tuple[type, BaseException, object]) -> None:
+    """Go on if another process removed a file of the folder first; else the rest would stay, and without a record."""
+    if not isinstance(failure[1], FileNotFoundError):
+        raise failure[1]

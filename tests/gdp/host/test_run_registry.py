@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,25 @@ def test_the_end_of_a_run_leaves_nothing(runs: RunRegistry, tmp_path: Path) -> N
     run = runs.start()
     (run.directory / "keys").mkdir()
     (run.directory / "keys" / "a").write_text("secret")
+    run.end()
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_folder_that_two_processes_remove_at_once_is_gone(
+    runs: RunRegistry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = runs.start()
+    for name in ("a", "b", "keys/c", "keys/d"):
+        (run.directory / name).parent.mkdir(exist_ok=True)
+        (run.directory / name).write_text("secret")
+    unlink = os.unlink
+
+    def unlink_second(path: str, *, dir_fd: int | None = None) -> None:
+        with suppress(FileNotFoundError):
+            unlink(path, dir_fd=dir_fd)
+        unlink(path, dir_fd=dir_fd)
+
+    monkeypatch.setattr(os, "unlink", unlink_second)
     run.end()
     assert list(tmp_path.rglob("*")) == []
 
