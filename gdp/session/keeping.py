@@ -28,7 +28,7 @@ from gdp.crypto.identity import Identity
 from gdp.due_queue import earliest
 from gdp.errors import GdpError, LocalError, StoreError
 from gdp.intervals import PACE_S, SCHEDULED_S, TICK_S
-from gdp.limits import WINDOW_BYTES
+from gdp.limits import COST_UNREACHABLE, WINDOW_BYTES
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.service.replication import Mode, Replication
@@ -453,6 +453,11 @@ class CapsuleKeeper:
         """Append what was published so far, for ``is_uploaded``."""
         for kept in self.capsules:
             kept.flush(int(unix_s * 1e9))
+
+    def has_path(self, now_s: float) -> bool:
+        """Return whether a path leads to one of the holders."""
+        paths = (each.path(now_s) for each in self._clients.values())
+        return any(path is not None and path.cost < COST_UNREACHABLE for path in paths)
 
     @property
     def is_uploaded(self) -> bool:

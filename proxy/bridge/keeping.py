@@ -65,7 +65,7 @@ class TopicKeeper:
         self._failing: set[Name] = set()  # capsules
         self._when: dict[str, set[Name]] = {}  # topics that each event marks
         self._fault_counts: dict[str, int] = {}
-        self._was_attached = False
+        self._had_path = False
         self._joins: dict[Name, _Joining] = {}
         self.capsules = CapsuleKeeper(member, identity, folder, start=secrets.randbits(63))
 
@@ -145,7 +145,7 @@ class TopicKeeper:
 
     def handle(self, now: Timestamps, faults: Faults) -> None:
         """Write and upload what is there, and report what is not kept or not taken by its holder."""
-        self._find_events(faults)
+        self._find_events(faults, now.mono_s)
         self.capsules.handle(now)
         for joining in list(self._joins.values()):
             self._ask(joining, now.mono_s, faults)
@@ -160,13 +160,14 @@ class TopicKeeper:
                 for local in locals_:
                     faults.clear(local, Fault.NOT_KEPT)
 
-    def _find_events(self, faults: Faults) -> None:
+    def _find_events(self, faults: Faults, now_s: float) -> None:
         if not self._when:
             return
-        is_attached = self._member.attachment.switch is not None
-        if self._was_attached and not is_attached:
-            self.handle_event(UPLINK_LOST, faults)
-        self._was_attached = is_attached
+        if UPLINK_LOST in self._when:
+            has_path = self._member.attachment.switch is not None and self.capsules.has_path(now_s)
+            if self._had_path and not has_path:
+                self.handle_event(UPLINK_LOST, faults)
+            self._had_path = has_path
         counts = faults.counts if self._when.keys() & _FAULTS.keys() else {}
         for word in [word for word, count in counts.items() if count > self._fault_counts.get(word, 0)]:
             self.handle_event(word, faults)

@@ -134,6 +134,25 @@ def test_without_a_mark_nothing_is_uploaded_and_the_ring_stays_small(tmp_path: P
     assert robot.keeping.kept.poll_faults() == []
 
 
+def test_a_cut_behind_the_own_switch_leaves_no_path_to_the_holder_until_it_is_healed(tmp_path: Path) -> None:
+    robot = Recorded(tmp_path)
+
+    def has_path() -> bool:
+        return robot.keeping.keeper.has_path(robot.world.network.now.mono_s)
+
+    assert not has_path()
+    assert robot.keeping.run(5, robot.holder, until=has_path)
+    uplink = robot.world.cables[frozenset(("nuc1", "nuc2"))]
+    for _ in range(2):
+        robot.world.network.set_link(uplink, up=False)
+        assert robot.keeping.run(3, robot.holder, until=lambda: not has_path())
+        assert robot.keeping.flow.member.attachment.switch is not None
+        robot.keeping.run(40, robot.holder)
+        assert not has_path()
+        robot.world.network.set_link(uplink, up=True)
+        assert robot.keeping.run(15, robot.holder, until=has_path)
+
+
 def test_a_window_that_the_ring_could_not_keep_is_named(tmp_path: Path) -> None:
     robot = Recorded(tmp_path, most_bytes=100_000)
     robot.world.network.set_link(robot.world.leads[ROBOT], up=False)

@@ -70,11 +70,13 @@ def test_a_message_a_lost_uplink_and_a_fault_mark_the_topics_whose_rules_state_t
     def kept(local: str) -> Any:
         return SimpleNamespace(mark=lambda name, _time_ns: marked.append((local, name)), name=local)
 
+    paths = [True]
     held: Any = SimpleNamespace(
         topics={name: kept(local) for name, local in topics.items()},
         capsules=[],
         handle=lambda _now: None,
         keep=lambda *_: None,
+        has_path=lambda _now_s: paths[0],
     )
     keeper.capsules = held
     events = {"/scan": ("/estop", "uplink-lost", "too-fast"), "/image": ("/estop",)}
@@ -99,6 +101,11 @@ def test_a_message_a_lost_uplink_and_a_fault_mark_the_topics_whose_rules_state_t
     faults.report("/image", Fault.TOO_FAST, "a slow path")
     faults.report("/image", Fault.CLOCK, "another machine")
     assert news() == [("/scan", "too-fast")]
+    paths[0] = False
+    assert news() == [("/scan", "uplink-lost")]
+    assert news() == []
+    paths[0] = True
+    assert news() == []
     sites.world.network.set_link(sites.world.leads["nuc1/robot"], up=False)
     sites.world.network.run(30)
     assert news() == [("/scan", "uplink-lost")]
