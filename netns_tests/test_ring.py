@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
+from glob import glob
 from pathlib import Path
 from typing import Final
 from unittest import mock
@@ -233,9 +234,8 @@ def test_wrong_input_is_reported_before_anything_starts(arguments: Sequence[str]
 
 def left_of(run: str) -> list[str]:
     """Return the remains of a run: records, namespaces, files, processes."""
-    places = [Path("/run/gdp"), Path("/run/netns"), Path(tempfile.gettempdir())]
-    files = [str(path) for place in places if place.is_dir() for path in place.iterdir() if run in path.name]
-    return [*files, *commands_with(run)]
+    places = ("/run/gdp", "/run/netns", tempfile.gettempdir())
+    return [*(path for place in places for path in glob(f"{place}/*{run}*")), *commands_with(run)]
 
 
 def commands_with(word: str) -> list[str]:
