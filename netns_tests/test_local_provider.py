@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import signal
@@ -19,6 +20,7 @@ from fog.hardware import Hardware
 from fog.host.status import Status
 from fog.machine import MachineState
 from fog.providers.local import fault_injection
+from fog.providers.local.machine_file import MachineFile
 from fog.providers.local.machine_handle import find
 from fog.providers.local.netlinks import exists
 from fog.providers.local.provider import LocalProvider
@@ -147,6 +149,27 @@ def test_a_killed_machine_is_gone_with_its_link(provider: LocalProvider) -> None
     until(lambda: machine_of(provider, machine).state is MachineState.GONE, "gone")
     assert machine_of(provider, machine).reason == "killed"
     assert not exists(found.gateway, found.gateway_device)
+
+
+def test_a_machine_that_is_found_gone_is_written_while_nobody_removes_it(
+    provider: LocalProvider, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine, held, write = booted(provider), list[bool](), MachineFile.write
+
+    def locked(file: MachineFile, directory: Path) -> None:
+        with (folder / ".lock").open("w") as other:
+            try:
+                fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                held.append(True)
+        write(file, directory)
+
+    monkeypatch.setattr(MachineFile, "write", locked)
+    host = find(provider.runs, machine).host
+    assert host is not None
+    os.kill(host.pid, signal.SIGKILL)
+    until(lambda: machine_of(provider, machine).state is MachineState.GONE, "gone")
+    assert held == [True]
 
 
 @pytest.mark.usefixtures("either")

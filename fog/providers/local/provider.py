@@ -237,7 +237,7 @@ class LocalProvider:
     def _is_forgotten(self, machine: LocalMachine, now_unix_s: float) -> bool:
         """Record when it was first observed as gone, and remove it after ``_GONE_S``; return whether it was removed."""
         if machine.file.gone_unix_s is None:
-            with suppress(OSError):  # another process removes it
+            with self._alone(), suppress(OSError):  # another process has removed it
                 replace(machine.file, gone_unix_s=now_unix_s).write(machine.directory)
             return False
         if now_unix_s - machine.file.gone_unix_s < _GONE_S:
