@@ -151,7 +151,7 @@ def test_a_killed_machine_is_gone_with_its_link(provider: LocalProvider) -> None
     assert not exists(found.gateway, found.gateway_device)
 
 
-def test_a_machine_that_is_found_gone_is_written_while_nobody_removes_it(
+def test_a_machine_that_is_found_gone_is_written_under_the_lock_of_removals(
     provider: LocalProvider, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine, held, write = booted(provider), list[bool](), MachineFile.write
