@@ -9,9 +9,9 @@ Attributes:
     PLAINTEXT: the buffer of a message that is opened part by part.
     DIGEST: SHA-256, which a cipher's calls also feed.
     received: makes received frames of the slots of a pool.
-    runs: finds the slots that leave together.
+    runs: finds the slots that leave together; compiled, ``SYSTEM_CALLS`` does that as it forwards.
     samples: finds the samples among frames.
-    SYSTEM_CALLS: receives and sends many frames in one call; None: ``gdp/ports`` does it by ctypes or sockets.
+    SYSTEM_CALLS: receives, sends or forwards many frames in one call; None: ``gdp/ports`` does, by ctypes or sockets.
     VARIANT: which twins are in use, in words.
 """
 
@@ -27,7 +27,7 @@ from gdp.burst.slots import received, runs, samples
 
 __all__ = ["CIPHER", "DIGEST", "PLAINTEXT", "SYSTEM_CALLS", "VARIANT", "received", "runs", "samples"]
 
-_INTERFACE: Final = 5  # as in ``core.c``
+_INTERFACE: Final = 6  # as in ``core.c``
 
 
 def _compiled() -> Any:
@@ -43,5 +43,5 @@ _core = SYSTEM_CALLS = _compiled()
 CIPHER, PLAINTEXT, DIGEST, VARIANT = MessageCipher, Plaintext, hashlib.sha256, "Python"
 if _core is not None:
     CIPHER, PLAINTEXT, DIGEST = _core.MessageCipher, _core.Plaintext, _core.RunningDigest
-    received, runs, samples = _core.received, _core.runs, _core.samples
+    received, samples = _core.received, _core.samples
     VARIANT = f"compiled, {_core.LIBRARY}"

@@ -186,43 +186,178 @@ static double waited_s(int source)
     return since_s >= 0.0 && since_s < WAITED_MOST_S ? since_s : 0.0;
 }
 
-static PyObject *receiver_receive(Receiver *self, PyObject *args)
+/* Writes the key of a frame in the forwarding table; returns 0 if it is for the node itself, or not in order. */
+static int key_of(const uint8_t *frame, Py_ssize_t size, uint8_t *key)
 {
-    int source, got = 0;
-    double since_s = 0.0;
-    PyObject *port;
-    if (!PyArg_ParseTuple(args, "iO:receive", &source, &port))
-        return NULL;
+    uint8_t hops = frame[HOPS_AT];
+    if (frame[0] != VERSION || frame[1] >= CONTROL_FROM || (hops & HOPS_MASK) <= 1 ||
+        HEADER + (frame[LENGTH_AT] << 8 | frame[LENGTH_AT + 1]) > size)
+        return 0;
+    memcpy(key, frame + DESTINATION_AT, ENDS);
+    if (hops & SECOND_PATH)
+        key[DESTINATION - 1] ^= 1;
+    return 1;
+}
+
+/* Fills the slots with the frames that wait at a socket, and returns how many came; -1 and an exception: no memory.
+ * No frames, or the device went down: the link monitor reports it. */
+static int fill_slots(Receiver *self, int source, int *sizes, double *since_s)
+{
+    struct mmsghdr messages[AT_ONCE];
+    struct iovec vectors[AT_ONCE];
+    int got;
     if (self->pool == NULL || Py_REFCNT(self->pool) > 1) {
         Py_XDECREF(self->pool);
         self->pool = PyByteArray_FromStringAndSize(NULL, self->slots * self->slot_bytes);
     }
-    Arrivals *arrivals = allocate(arrivals_type, 0);
-    if (self->pool == NULL || arrivals == NULL) {
-        Py_XDECREF(arrivals);
-        return NULL;
-    }
-    struct mmsghdr messages[AT_ONCE];
-    struct iovec vectors[AT_ONCE];
+    if (self->pool == NULL)
+        return -1;
     memset(messages, 0, self->slots * sizeof *messages);
     for (Py_ssize_t slot = 0; slot < self->slots; slot++) {
         vectors[slot] = (struct iovec){PyByteArray_AsString(self->pool) + slot * self->slot_bytes, self->slot_bytes};
         messages[slot].msg_hdr.msg_iov = vectors + slot;
         messages[slot].msg_hdr.msg_iovlen = 1;
     }
-    arrivals->pool = same(self->pool);
+    PyObject *held = same(self->pool);
     Py_BEGIN_ALLOW_THREADS;
     got = recvmmsg(source, messages, (unsigned)self->slots, MSG_DONTWAIT, NULL);
-    if (got > 0)
-        since_s = waited_s(source);
+    if (got > 0 && since_s != NULL)
+        *since_s = waited_s(source);
     Py_END_ALLOW_THREADS;
+    Py_DECREF(held);
+    for (int slot = 0; slot < got; slot++)
+        sizes[slot] = messages[slot].msg_len > ETHER ? (int)messages[slot].msg_len - ETHER : 0;
+    return got > 0 ? got : 0;
+}
+
+static PyObject *receiver_receive(Receiver *self, PyObject *args)
+{
+    int source;
+    double since_s = 0.0;
+    PyObject *port;
+    if (!PyArg_ParseTuple(args, "iO:receive", &source, &port))
+        return NULL;
+    Arrivals *arrivals = allocate(arrivals_type, 0);
+    int got = arrivals == NULL ? -1 : fill_slots(self, source, arrivals->sizes, &since_s);
+    if (got < 0) {
+        Py_XDECREF(arrivals);
+        return NULL;
+    }
+    arrivals->pool = same(self->pool);
     arrivals->slot_bytes = self->slot_bytes;
-    arrivals->count = got > 0 ? got : 0; /* no frames, or the device went down: the link monitor reports it */
-    for (Py_ssize_t slot = 0; slot < arrivals->count; slot++)
-        arrivals->sizes[slot] = messages[slot].msg_len > ETHER ? (int)messages[slot].msg_len - ETHER : 0;
+    arrivals->count = got;
     arrivals->port = same(port);
     arrivals->waited_s = PyFloat_FromDouble(since_s);
     return (PyObject *)arrivals;
+}
+
+/* Calls ``failed`` with an errno and the frames that are left; returns how many of these are lost, or -1. */
+static Py_ssize_t ask_failed(PyObject *failed, int error, Py_ssize_t left)
+{
+    PyObject *answer = PyObject_CallFunction(failed, "in", error, left);
+    Py_ssize_t lost = answer == NULL ? -1 : PyNumber_AsSsize_t(answer, PyExc_OverflowError);
+    Py_XDECREF(answer);
+    return lost > 0 || PyErr_Occurred() ? lost : left;
+}
+
+/* Sends ``count`` slots from ``slot`` on to one neighbour; returns how many left, or -1 and an exception. */
+static Py_ssize_t send_slots(const Receiver *self, char *slot, const int *sizes, Py_ssize_t count, PyObject *hop,
+                             PyObject *failed)
+{
+    struct mmsghdr messages[AT_ONCE];
+    struct iovec vectors[2 * AT_ONCE];
+    char head[ETHER];
+    const char *macs;
+    Py_ssize_t macs_size, sent = 0;
+    int sink, error;
+    if (!PyArg_ParseTuple(hop, "iy#:hop", &sink, &macs, &macs_size))
+        return -1;
+    if (macs_size != 2 * MAC) {
+        refusal("two addresses");
+        return -1;
+    }
+    memcpy(head, macs, 2 * MAC);
+    memcpy(head + 2 * MAC, slot + 2 * MAC, ETHER - 2 * MAC);
+    memset(messages, 0, count * sizeof *messages);
+    for (Py_ssize_t each = 0; each < count; each++) {
+        vectors[2 * each] = (struct iovec){head, ETHER};
+        vectors[2 * each + 1] = (struct iovec){slot + each * self->slot_bytes + ETHER, (size_t)sizes[each]};
+        messages[each].msg_hdr.msg_iov = vectors + 2 * each;
+        messages[each].msg_hdr.msg_iovlen = 2;
+    }
+    for (Py_ssize_t at = 0, step; at < count; at += step) {
+        Py_BEGIN_ALLOW_THREADS;
+        step = sendmmsg(sink, messages + at, (unsigned)(count - at), MSG_DONTWAIT);
+        error = errno;
+        Py_END_ALLOW_THREADS;
+        if (step > 0)
+            sent += step;
+        else if ((step = ask_failed(failed, error, count - at)) < 0)
+            return -1;
+    }
+    return sent;
+}
+
+/* Sends a run to each hop that ``route`` returns, or gives its frames to ``other``; returns as ``send_slots``. */
+static Py_ssize_t forward_run(const Receiver *self, char *slot, const int *sizes, Py_ssize_t count, const uint8_t *key,
+                              PyObject *const callbacks[3])
+{
+    Py_ssize_t sent = 0, left = 0, largest = 0;
+    PyObject *hops = NULL;
+    for (Py_ssize_t each = 0; each < count; each++)
+        largest = sizes[each] > largest ? sizes[each] : largest;
+    if (key != NULL) {
+        PyObject *found = PyObject_CallFunction(callbacks[0], "y#n", key, (Py_ssize_t)ENDS, largest);
+        hops = found == NULL ? NULL : PySequence_Tuple(found);
+        Py_XDECREF(found);
+        if (hops == NULL)
+            return -1;
+    }
+    Py_ssize_t hop_count = hops == NULL ? 0 : PyTuple_Size(hops);
+    for (Py_ssize_t each = 0; hop_count == 0 && left >= 0 && each < count; each++) {
+        PyObject *done = PyObject_CallFunction(callbacks[1], "y#", slot + each * self->slot_bytes, (Py_ssize_t)(ETHER + sizes[each]));
+        left = done == NULL ? -1 : 0;
+        Py_XDECREF(done);
+    }
+    for (Py_ssize_t each = 0; hop_count > 0 && each < count; each++)
+        slot[each * self->slot_bytes + ETHER + HOPS_AT]--;
+    for (Py_ssize_t hop = 0; left >= 0 && hop < hop_count; hop++) {
+        left = send_slots(self, slot, sizes, count, PyTuple_GetItem(hops, hop), callbacks[2]);
+        sent += left;
+    }
+    Py_XDECREF(hops);
+    return left < 0 ? -1 : sent;
+}
+
+static PyObject *receiver_forward(Receiver *self, PyObject *args)
+{
+    int source, got, sizes[AT_ONCE];
+    PyObject *callbacks[3];
+    uint8_t key[ENDS] = {0}, run_key[ENDS] = {0};
+    Py_ssize_t first = 0, sent = 0, left = 0;
+    int has_key = 0, had_key = 0;
+    if (!PyArg_ParseTuple(args, "iOOO:forward", &source, callbacks, callbacks + 1, callbacks + 2))
+        return NULL;
+    if (self->slot_bytes < ETHER + HEADER)
+        return refusal("slots for a header");
+    if ((got = fill_slots(self, source, sizes, NULL)) < 0)
+        return NULL;
+    PyObject *pool = same(self->pool);
+    char *begin = PyByteArray_AsString(pool);
+    for (Py_ssize_t slot = 0; slot <= got && left >= 0; slot++) {
+        if (slot < got)
+            has_key = key_of((const uint8_t *)begin + slot * self->slot_bytes + ETHER, sizes[slot], key);
+        if (slot && (slot == got || !has_key || !had_key || memcmp(key, run_key, ENDS))) {
+            left = forward_run(self, begin + first * self->slot_bytes, sizes + first, slot - first,
+                               had_key ? run_key : NULL, callbacks);
+            sent += left;
+            first = slot;
+        }
+        had_key = has_key;
+        memcpy(run_key, key, ENDS);
+    }
+    Py_DECREF(pool);
+    return left < 0 ? NULL : Py_BuildValue("in", got, sent);
 }
 
 static PyObject *send_frames(PyObject *module, PyObject *args)
@@ -283,52 +418,6 @@ static PyObject *received(PyObject *module, PyObject *args)
     return list;
 }
 
-/* Writes the key of a frame in the forwarding table; returns 0 if it is for the node itself, or not in order. */
-static int key_of(const uint8_t *frame, Py_ssize_t size, uint8_t *key)
-{
-    uint8_t hops = frame[HOPS_AT];
-    if (frame[0] != VERSION || frame[1] >= CONTROL_FROM || (hops & HOPS_MASK) <= 1 ||
-        HEADER + (frame[LENGTH_AT] << 8 | frame[LENGTH_AT + 1]) > size)
-        return 0;
-    memcpy(key, frame + DESTINATION_AT, ENDS);
-    if (hops & SECOND_PATH)
-        key[DESTINATION - 1] ^= 1;
-    return 1;
-}
-
-static PyObject *runs(PyObject *module, PyObject *args)
-{
-    PyObject *pool, *sizes;
-    Py_ssize_t slot_bytes, first = 0, largest = 0;
-    uint8_t key[ENDS] = {0}, run_key[ENDS] = {0};
-    int has_key = 0, had_key = 0;
-    (void)module;
-    if (!PyArg_ParseTuple(args, "YnO!:runs", &pool, &slot_bytes, &PyList_Type, &sizes))
-        return NULL;
-    Py_ssize_t count = PyList_Size(sizes);
-    if (slot_bytes < ETHER + HEADER || count > PyByteArray_Size(pool) / slot_bytes)
-        return refusal("as many slots as the pool has");
-    PyObject *found = PyList_New(0);
-    for (Py_ssize_t slot = 0; found != NULL && slot <= count; slot++) {
-        Py_ssize_t size = slot < count ? PyNumber_AsSsize_t(PyList_GetItem(sizes, slot), NULL) : 0;
-        if (slot < count)
-            has_key = key_of((const uint8_t *)PyByteArray_AsString(pool) + slot * slot_bytes + ETHER, size, key);
-        if (slot && (slot == count || !has_key || !had_key || memcmp(key, run_key, ENDS))) {
-            PyObject *run = Py_BuildValue("nny#n", first, slot - first, run_key, (Py_ssize_t)(had_key ? ENDS : 0), largest);
-            if (run == NULL || PyList_Append(found, run) < 0)
-                Py_CLEAR(found);
-            Py_XDECREF(run);
-            first = slot;
-        }
-        largest = first == slot || size > largest ? size : largest;
-        had_key = has_key;
-        memcpy(run_key, key, ENDS);
-    }
-    if (PyErr_Occurred())
-        Py_CLEAR(found);
-    return found;
-}
-
 /* ---- samples ---- */
 
 /* Returns whether a frame is a sample, and its seal. */
@@ -372,7 +461,6 @@ static PyObject *samples(PyObject *module, PyObject *args)
 
 static PyMethodDef functions[] = {
     {"received", received, METH_VARARGS, "As slots.received."},
-    {"runs", runs, METH_VARARGS, "As slots.runs."},
     {"samples", samples, METH_VARARGS, "As slots.samples."},
     {"send", send_frames, METH_VARARGS, "Send frames of a list from a place on; return how many, or minus the errno."},
     {NULL, NULL, 0, NULL},
@@ -380,6 +468,8 @@ static PyMethodDef functions[] = {
 
 static PyMethodDef receiver_methods[] = {
     {"receive", (PyCFunction)receiver_receive, METH_VARARGS, "Return the frames that wait at a socket, as of a port."},
+    {"forward", (PyCFunction)receiver_forward, METH_VARARGS,
+     "Forward the frames that wait at a socket, by route, other and failed; return how many came, and how many left."},
     {NULL, NULL, 0, NULL},
 };
 

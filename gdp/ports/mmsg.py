@@ -18,11 +18,12 @@ import errno
 import socket
 from array import array
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 from gdp import burst
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
+from gdp.frame.codec import ETHER_BYTES, ETHERTYPE, HOPS_AT
 from gdp.ports.sockets import waited_s
 from gdp.sansio import ReceivedFrame
 
@@ -30,6 +31,9 @@ SLOTS: Final = 64
 _TAKE_BYTES: Final = 128 << 10  # approximate size of one batch, so that urgent frames wait only briefly
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
 _DONTWAIT: Final = int(socket.MSG_DONTWAIT)
+
+_ONE_LESS: Final = bytes([255, *range(255)])  # of hops left
+Route = Callable[[bytes, int], Sequence[tuple[int, bytes]]]
 
 _SEND_ERRORS: Final = {
     errno.ENOBUFS: (DropReason.PORT_FULL, True),
@@ -43,19 +47,21 @@ def send_failure(number: int) -> tuple[DropReason, bool]:
     return _SEND_ERRORS.get(number, (DropReason.PORT_DOWN, False))
 
 
+def _count_lost(drops: list[int], number: int, left: int) -> int:
+    """Count the frames that are lost by the errno of a send, and return how many of those ``left`` these are."""
+    reason, goes_on = send_failure(number)
+    lost = 1 if goes_on else left
+    drops[reason] += lost
+    return lost
+
+
 def _send_all(send: Callable[[int], int], at: int, end: int, drops: list[int]) -> int:
     """Send frames ``at`` to ``end``; ``send`` returns how many left from a place on, or minus the errno."""
     left = 0
     while at < end:
         sent = send(at)
-        if sent > 0:
-            left += sent
-            at += sent
-            continue
-        reason, goes_on = send_failure(-sent)
-        skipped = 1 if goes_on else end - at
-        drops[reason] += skipped
-        at += skipped
+        left += max(sent, 0)
+        at += sent if sent > 0 else _count_lost(drops, -sent, end - at)
     return left
 
 
@@ -152,17 +158,36 @@ class MmsgBatch:
             self._pointers[:count] = list(some)
             self._own_addresses[:count] = self._addresses[:count]
             self._own_sizes[:count] = memoryview(array("L", map(len, some)))
-            left += self._submit(sink, self._own_at, 0, count, macs, drops)
+            left += self._submit(sink.fileno(), self._own_at, 0, count, macs, drops)
         return left
 
-    def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
-        """Send the slots ``first`` to ``first + count``, last filled by ``receive``, as ``send``."""
-        return self._submit(sink, self._out_at, first, count, macs, drops)
+    def forward(
+        self, source: socket.socket, route: Route, other: Callable[[bytes], None], drops: list[int]
+    ) -> tuple[int, int]:
+        """Receive frames and forward them; return how many came, and how many left.
 
-    def _submit(self, sink: socket.socket, table: int, first: int, count: int, macs: bytes, drops: list[int]) -> int:
+        Args:
+            route: returns the hops, each a socket's descriptor and a pair of addresses, of frames that follow each
+                other, by their key (``burst.runs``) and the bytes of the largest; none: each goes to ``other``.
+            other: gets a frame, from its Ethernet header on, that is for the node itself or has no hops.
+            drops: counts frames that are not sent.
+        """
+        sizes, sent, pool, step = self.receive(source), 0, self.pool, self.slot_bytes
+        for first, count, key, largest in burst.runs(pool, step, sizes):
+            hops, at = route(key, largest) if key else (), first * step
+            if hops:
+                hops_left = slice(at + ETHER_BYTES + HOPS_AT, at + count * step, step)
+                pool[hops_left] = pool[hops_left].translate(_ONE_LESS)
+            for fd, macs in hops:
+                sent += self._submit(fd, self._out_at, first, count, macs, drops)
+            for slot in range(first, first if hops else first + count):
+                other(bytes(pool[slot * step : slot * step + ETHER_BYTES + sizes[slot]]))
+        return len(sizes), sent
+
+    def _submit(self, fd: int, table: int, first: int, count: int, macs: bytes, drops: list[int]) -> int:
         """Send ``count`` messages of the table of messages at an address."""
         self._head[: len(macs)] = macs
-        fd, end = sink.fileno(), first + count
+        end = first + count
 
         def send(at: int) -> int:
             sent: int = self._send(fd, table + at * ctypes.sizeof(_MmsgHdr), end - at, _DONTWAIT)
@@ -183,13 +208,20 @@ class CompiledBatch(MmsgBatch):
         arrivals: Sequence[ReceivedFrame] = self._receiver.receive(source.fileno(), port)
         return arrivals
 
+    def forward(
+        self, source: socket.socket, route: Route, other: Callable[[bytes], None], drops: list[int]
+    ) -> tuple[int, int]:
+        """Receive frames and forward them; return how many came, and how many left, as ``MmsgBatch``."""
+        done: tuple[int, int] = self._receiver.forward(source.fileno(), route, other, partial(_count_lost, drops))
+        return done
+
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
         """Send frames to one pair of addresses; return how many were sent, as ``MmsgBatch``."""
         send, head = burst.SYSTEM_CALLS.send, (macs + _ETHERTYPE)[:ETHER_BYTES]
         return _send_all(lambda at: send(sink.fileno(), frames, at, head), 0, len(frames), drops)
 
 
-def put_one(sink: socket.socket, frame: bytes, macs: bytes, drops: list[int]) -> int:
+def put_one(sink: socket.socket, frame: bytes | bytearray, macs: bytes, drops: list[int]) -> int:
     """Send one frame (from the GDP header on), faster than as a batch; return how many were sent: 0 or 1."""
     try:
         sink.send(macs + _ETHERTYPE + frame)

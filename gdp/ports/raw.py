@@ -21,7 +21,6 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Final
 
-from gdp import burst
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import (
     CONTROL_FROM,
@@ -36,7 +35,7 @@ from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import MmsgBatch, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import Port
+from gdp.ports.plane import MAC_BYTES, Port
 from gdp.ports.sockets import (
     TrafficClass,
     attach_drop_all_filter,
@@ -50,7 +49,6 @@ from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
 from gdp.token_bucket import TokenBucket
 
-_ONE_LESS: Final = bytes([255, *range(255)])  # of hops left
 _URGENT: Final = int(Flag.URGENT)
 _CLASSES: Final = (
     TrafficClass.HELLO,
@@ -104,9 +102,9 @@ class RawPlane(NetdevPlane):
         opened = sockets[port.index] = open_port(port.ifname, traffic_class, bypass_qdisc=self._bypass_qdisc)
         if self._entries is None:
             keep_arrival_times(opened)
-            ready = partial(self._punt_all, port.index, opened)
+            ready: Callable[[], None] = partial(self._punt_all, port.index, opened)
         else:
-            ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
+            ready = self._forwarding(self._entries, self._sides, port.index, opened, sockets)
         if traffic_class in (TrafficClass.HELLO, TrafficClass.GUEST):
             ready = partial(self._take_some, opened, TokenBucket(*_GREETINGS), ready)
         self.watch(opened, ready, rank=rank)
@@ -218,37 +216,40 @@ class RawPlane(NetdevPlane):
         self._came[port] += len(arrivals)
         self._keep(arrivals)
 
-    def _forward_all(
+    def _forwarding(
         self,
         entries: Mapping[bytes, Hops],
         sides: Mapping[bytes, int],
         port: int,
         source: socket.socket,
         sinks: Mapping[int, socket.socket],
-    ) -> None:
-        """Receive one batch from a port and forward it by ``sinks``; punt the frames for the node."""
-        batch = self._batch
-        pool, step = batch.pool, batch.slot_bytes
-        sizes = batch.receive(source)
-        self._counters.frames_in += len(sizes)
-        self._came[port] += len(sizes)
-        for first, count, key, largest in burst.runs(pool, step, sizes):
+    ) -> Callable[[], None]:
+        """Return what receives one batch from a port, forwards it by ``sinks``, and punts the frames for the node."""
+        counters, mtus, paces, came_by = self._counters, self._mtus, self._paces, self._came
+        other = partial(self._consider, entries, sides, port, sinks)
+
+        def route(key: bytes, largest: int) -> Sequence[tuple[int, bytes]]:
+            """Return the hops of frames whose key alone decides; none if one of the links is down or too narrow."""
             hops = entries.get(key)
             if hops is None:
                 hops = entries.get(key[:NAME_BYTES], NOWHERE)
-            is_from_side = key not in sides or is_side(sides[key], port)
-            if key and largest <= self._narrowest(hops) and is_from_side and key not in self._paces:
-                at = first * step + ETHER_BYTES + HOPS_AT
-                end = at + (count - 1) * step + 1
-                pool[at:end:step] = pool[at:end:step].translate(_ONE_LESS)
-                self._send(sinks, hops, first, count)
-            else:
-                for slot in range(first, first + count):
-                    self._consider(entries, sides, port, sinks, slot, sizes[slot])
+            if key in paces or (key in sides and not is_side(sides[key], port)):
+                return ()
+            leads = []
+            for hop in hops:
+                if largest > mtus.get(hop[0], 0):
+                    return ()
+                leads.append((sinks[hop[0]].fileno(), hop[1]))
+            return leads
 
-    def _narrowest(self, hops: Hops) -> int:
-        """Return the size that the links of all hops accept; 0 if one is down or there is none."""
-        return min((self._mtus.get(hop[0], 0) for hop in hops), default=0)
+        def forward() -> None:
+            came, left = self._batch.forward(source, route, other, counters.drops)
+            counters.frames_in += came
+            came_by[port] += came
+            counters.forwarded += left
+            counters.frames_out += left
+
+        return forward
 
     def _consider(
         self,
@@ -256,33 +257,24 @@ class RawPlane(NetdevPlane):
         sides: Mapping[bytes, int],
         port: int,
         sinks: Mapping[int, socket.socket],
-        slot: int,
-        size: int,
+        received: bytes,
     ) -> None:
-        """Decide on one frame in a slot with the reference, and act on the decision."""
-        batch, drops = self._batch, self._counters.drops
-        at = slot * batch.slot_bytes
-        decision = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port, self._paces)
+        """Decide on one frame with the reference, and act on the decision."""
+        counters = self._counters
+        decision = decide(received, entries, self._mtus, sides, port, self._paces)
         if isinstance(decision, Drop):
-            drops[decision.reason] += 1
+            counters.drops[decision.reason] += 1
         elif isinstance(decision, Forward):
             for reason in decision.lost:
-                drops[reason] += 1
-            batch.pool[at + ETHER_BYTES + HOPS_AT] -= 1
-            self._send(sinks, decision.hops, slot, 1)
+                counters.drops[reason] += 1
+            frame = bytearray(received[ETHER_BYTES:])
+            frame[HOPS_AT] -= 1
+            for hop in decision.hops:
+                left = put_one(sinks[hop[0]], frame, hop[1], counters.drops)
+                counters.forwarded += left
+                counters.frames_out += left
         else:
-            slot_bytes = ETHER_BYTES + size
-            self._keep(burst.received(batch.pool[at : at + slot_bytes], slot_bytes, [size], port, 0.0))
-
-    def _send(self, sinks: Mapping[int, socket.socket], hops: Hops, first: int, count: int) -> None:
-        """Send a run of slots to every hop."""
-        if not count:
-            return
-        counters = self._counters
-        for hop in hops:
-            left = self._batch.forward(sinks[hop[0]], first, count, hop[1], counters.drops)
-            counters.forwarded += left
-            counters.frames_out += left
+            self._keep([ReceivedFrame(port, received[MAC_BYTES : 2 * MAC_BYTES], received[ETHER_BYTES:])])
 
 
 class Closing:

@@ -10,7 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from random import Random
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
@@ -20,10 +20,11 @@ from gdp import burst
 from gdp.burst import slots
 from gdp.burst.cipher import BODY_AT, TAG_BYTES, MessageCipher, Plaintext
 from gdp.crypto.envelope import SEAL_BYTES, SIGNATURE_BYTES, KeyContext, Opener, Sealer
-from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
-from gdp.frame.codec import HOPS_AT, Header, Kind, decode, encode
+from gdp.errors import DROP_COUNTERS, DropReason, EnvelopeError, FrameError, StatementError
+from gdp.frame.codec import ETHERTYPE, HOPS_AT, Header, Kind, decode, encode
 from gdp.message.reassembly import Reassembler
 from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.ports.mmsg import CompiledBatch, MmsgBatch
 from gdp.sansio import ReceivedFrame
 from tests.gdp.message.sealed import INCARNATION, SECRET, SOURCE, TOPIC
 from tests.gdp.message.test_run import take
@@ -39,6 +40,7 @@ DIGESTS: tuple[Digest, ...] = (sha256, compiled.RunningDigest)
 TWINS = {"CIPHER": CIPHERS, "PLAINTEXT": PLAINTEXTS, "DIGEST": DIGESTS}
 CORPUS = Path(__file__).parents[2] / "corpus"
 KEY = bytes(range(32))
+ETHER = bytes(12) + ETHERTYPE.to_bytes(2, "big")
 
 
 def head_of(parts: int, number: int = 7, flags: int = 2) -> bytes:
@@ -155,10 +157,9 @@ def test_both_make_the_same_received_frames(frames: list[bytes], port: int, wait
 
 
 @given(st.integers(0, 1 << 32), st.integers(0, 20))
-def test_both_find_the_same_runs(seed: int, count: int) -> None:
-    chance, slot_bytes = Random(seed), 300
-    pool, sizes = bytearray(chance.randbytes(slot_bytes * (count + 1))), list[int]()
-    for slot in range(count):
+def test_both_forward_the_same_runs(seed: int, count: int) -> None:
+    chance, slot_bytes, frames = Random(seed), 300, list[bytes]()
+    for _ in range(count):
         length = chance.randint(0, 100)
         header = Header(
             chance.choice([1, 1, 1, 5, 0x80]), 0, chance.choice([16, 16, 16, 144, 1, 129]), 1, length, 7, 0, 1, 9,
@@ -166,20 +167,31 @@ def test_both_find_the_same_runs(seed: int, count: int) -> None:
         )  # fmt: skip
         frame = bytearray(encode(header) + chance.randbytes(length))
         frame[0] = chance.choice([1, 1, 1, 1, 2])
-        pool[slot * slot_bytes + 14 : slot * slot_bytes + 14 + len(frame)] = frame
-        sizes.append(max(len(frame) + chance.choice([0, 0, 0, 0, -1, 9, -100]), 0))
-    by_python, by_c = slots.runs(pool, slot_bytes, sizes), compiled.runs(pool, slot_bytes, sizes)
-    assert by_python == by_c
-    assert [slot for first, each, *_ in by_c for slot in range(first, first + each)] == [*range(count)]
+        frames.append(ETHER + frame[: chance.choice([None, None, None, -1, 95])])
+    done = []
+    for kind in (MmsgBatch, CompiledBatch):
+        (one, source), (sink, end) = (socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2))
+        calls = list[object]()
+
+        def route(key: bytes, largest: int, calls: list[object] = calls, sink: socket.socket = sink) -> Any:
+            calls.append((key, largest))
+            return [(sink.fileno(), bytes(12))] * (key[0] == ord("d"))
+
+        with one, source, sink, end:
+            for each in frames:
+                one.send(each)
+            counts = kind(slot_bytes).forward(source, route, calls.append, [0] * DROP_COUNTERS)
+            done.append((counts, calls, [end.recv(slot_bytes) for _ in range(counts[1])]))
+    assert done[0] == done[1]
+    assert done[0][0][0] == count == done[0][0][1] + sum(isinstance(call, bytes) for call in done[0][1])
 
 
 def test_slots_that_the_pool_has_not_are_refused() -> None:
     for sizes in ([87], [-1], [0, 0, 0], [1 << 40]):
         with pytest.raises(ValueError, match="slots"):
             compiled.received(bytearray(200), 100, sizes, 0, 0.0)
-    for pool, slot_bytes, sizes in ((bytearray(200), 100, [1]), (bytearray(200), 110, [1, 1])):
-        with pytest.raises(ValueError, match="slots"):
-            compiled.runs(pool, slot_bytes, sizes)
+    with pytest.raises(ValueError, match="slots"):
+        compiled.Receiver(109, 1).forward(0, None, None, None)
     with pytest.raises(TypeError):
         compiled.received(bytes(200), 100, [1], 0, 0.0)
 

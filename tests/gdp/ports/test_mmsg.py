@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import errno
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gdp import burst
 from gdp.errors import DROP_COUNTERS, DropReason
+from gdp.frame.codec import HOPS_AT, Header, encode
 from gdp.ports.mmsg import SLOTS, CompiledBatch, MmsgBatch, make_batch, send_failure
 from gdp.sansio import ReceivedFrame
 
@@ -41,12 +46,33 @@ def received(end: socket.socket) -> list[bytes]:
             return frames
 
 
-def fill(batch: MmsgBatch, frames: list[bytes]) -> None:
-    """Write frames into the slots, as if they had been received."""
-    for slot, frame in enumerate(frames):
-        at = slot * batch.slot_bytes + len(ETHER)
-        batch.pool[at : at + len(frame)] = frame
-        batch._sizes[slot] = len(frame)
+def data(destination: bytes = b"d", payload: bytes = b"payload", hops_left: int = 16) -> bytes:
+    """Return a data frame with its Ethernet header."""
+    return ETHER + encode(Header(1, 0, hops_left, 1, len(payload), 7, 0, 1, 9, destination * 32, b"s" * 32)) + payload
+
+
+def key_of(destination: bytes) -> bytes:
+    """Return the key of such a frame."""
+    return destination * 32 + b"s" * 32
+
+
+def one_less(frame: bytes) -> bytes:
+    """Return a frame as it is forwarded."""
+    at = len(ETHER) + HOPS_AT
+    return frame[:at] + bytes([frame[at] - 1]) + frame[at + 1 :]
+
+
+def forwarded(batch: MmsgBatch, frames: Sequence[bytes], pair: Pair, drops: list[int]) -> tuple[int, int]:
+    """Let frames be received and forwarded to one sink; return how many came, and how many left."""
+    one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with one, other:
+        for frame in frames:
+            one.send(frame)
+        return batch.forward(other, lambda _key, _largest: [(pair[0].fileno(), MACS)], refuse, drops)
+
+
+def refuse(*values: object) -> Any:
+    raise AssertionError(values)
 
 
 def no_drops() -> list[int]:
@@ -54,44 +80,68 @@ def no_drops() -> list[int]:
 
 
 @KINDS
-def test_frames_leave_in_order_under_their_ethernet_header(kind: Make, pair: Pair) -> None:
-    batch, drops = kind(200), no_drops()
-    fill(batch, [b"one", b"", b"three"])
-    assert batch.forward(pair[0], 0, 3, MACS, drops) == 3
-    assert received(pair[1]) == [ETHER + b"one", ETHER, ETHER + b"three"]
+def test_frames_are_forwarded_in_order_under_a_new_ethernet_header_with_one_hop_less(kind: Make, pair: Pair) -> None:
+    frames, drops = [data(payload=b"%d" % each * each) for each in range(9)], no_drops()
+    old = [bytes(12) + frame[12:] for frame in frames]
+    assert forwarded(kind(300), old, pair, drops) == (9, 9)
+    assert received(pair[1]) == [one_less(frame) for frame in frames]
     assert drops == no_drops()
 
 
 @KINDS
-def test_only_the_named_slots_leave(kind: Make, pair: Pair) -> None:
-    batch = kind(200)
-    fill(batch, [b"zero", b"one", b"two", b"three"])
-    assert batch.forward(pair[0], 1, 2, MACS, no_drops()) == 2
-    assert received(pair[1]) == [ETHER + b"one", ETHER + b"two"]
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([b"a", b"b", b"c"]), st.binary(max_size=60), st.sampled_from([16, 16, 144, 1, 129]),
+            st.sampled_from([0, 0, 0, 5]),
+        ),
+        max_size=SLOTS,
+    ),
+    st.lists(st.integers(0, SLOTS - 1), max_size=2),
+)  # fmt: skip
+def test_each_frame_goes_once_to_each_hop_or_to_the_node_in_order(
+    kind: Make, drawn: list[tuple[bytes, bytes, int, int]], cut: list[int]
+) -> None:
+    frames = [data(*each[:3])[: -each[3] or None] for each in drawn]
+    frames = [frame[:50] if at in cut else frame for at, frame in enumerate(frames)]
+    hops = {key_of(b"a"): 1, key_of(b"b"): 2}  # of the others none is known
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(3)]
+    others, largest, drops = list[bytes](), list[tuple[bytes, int]](), no_drops()
+    (one, source), *sinks = pairs
+
+    def route(key: bytes, size: int) -> list[tuple[int, bytes]]:
+        largest.append((key, size))
+        return [(sink.fileno(), MACS) for sink, _ in sinks[: hops.get(key, 0)]]
+
+    with ExitStack() as stack:
+        for end in (each for pair in pairs for each in pair):
+            end.setblocking(False)
+            stack.enter_context(end)
+        for frame in frames:
+            one.send(frame)
+        came, left = kind(300).forward(source, route, others.append, drops)
+        got = [received(sink) for _, sink in sinks]
+    taken = [
+        each[0] if at not in cut and frame == data(*each[:3]) and each[2] == 16 else b"c"
+        for at, (frame, each) in enumerate(zip(frames, drawn, strict=True))
+    ]
+    for sink, to in ((0, b"ab"), (1, b"b")):
+        assert got[sink] == [one_less(frame) for frame, each in zip(frames, taken, strict=True) if each in to]
+    assert others == [frame for frame, each in zip(frames, taken, strict=True) if each == b"c"]
+    assert (came, left) == (len(frames), sum(map(len, got)))
+    assert all(size >= 96 for _, size in largest)
+    assert drops == no_drops()
 
 
 @KINDS
-def test_what_is_taken_stands_in_its_slots_and_can_leave_again(kind: Make, pair: Pair) -> None:
-    batch = kind(200)
-    for frame in (b"first", b"second"):
-        pair[1].send(bytes(14) + frame)
-    assert batch.receive(pair[0]) == [5, 6]
-    assert bytes(batch.pool[14:19]) == b"first"
-    batch.pool[200 + 14] = ord("S")
-    assert batch.forward(pair[0], 0, 2, MACS, no_drops()) == 2
-    assert received(pair[1]) == [ETHER + b"first", ETHER + b"Second"]
-
-
-@KINDS
-def test_a_single_frame_leaves_whole_after_shorter_ones_were_taken(kind: Make, pair: Pair) -> None:
-    batch = kind(200)
-    for frame in (b"one", b"two"):
-        pair[1].send(bytes(14) + frame)
-    batch.receive(pair[0])
-    pair[1].send(bytes(14) + b"a longer one")
-    assert batch.receive(pair[0]) == [12]
-    assert batch.forward(pair[0], 0, 1, MACS, no_drops()) == 1
-    assert received(pair[1]) == [ETHER + b"a longer one"]
+def test_a_failing_route_or_node_is_heard(kind: Make, pair: Pair) -> None:
+    batch = kind(300)
+    for route in (refuse, lambda *_: ()):
+        pair[1].send(data())
+        with pytest.raises(AssertionError):
+            batch.forward(pair[0], route, refuse, no_drops())
+    pair[1].send(data())
+    assert batch.forward(pair[0], lambda *_: (), lambda _: None, no_drops()) == (1, 0)
 
 
 @KINDS
@@ -157,10 +207,9 @@ def test_a_frame_longer_than_a_slot_arrives_cut_and_spoils_no_other(kind: Make, 
 
 @KINDS
 def test_a_full_queue_costs_the_frames_and_counts_them(kind: Make, pair: Pair) -> None:
-    batch, drops, left = kind(200), no_drops(), 0
-    fill(batch, [b"x"] * SLOTS)
+    batch, drops, left = kind(300), no_drops(), 0
     for _ in range(100):
-        left += batch.forward(pair[0], 0, SLOTS, MACS, drops)
+        left += forwarded(batch, [data()] * SLOTS, pair, drops)[1]
     assert left == len(received(pair[1]))
     assert drops[DropReason.PORT_FULL] == 100 * SLOTS - left > 0
     assert sum(drops) == drops[DropReason.PORT_FULL]
@@ -168,20 +217,18 @@ def test_a_full_queue_costs_the_frames_and_counts_them(kind: Make, pair: Pair) -
 
 @KINDS
 def test_a_sink_that_is_gone_counts_as_down(kind: Make, pair: Pair) -> None:
-    batch, drops = kind(200), no_drops()
-    fill(batch, [b"x", b"y"])
+    drops = no_drops()
     pair[1].close()
-    assert batch.forward(pair[0], 0, 2, MACS, drops) == 0
+    assert forwarded(kind(300), [data()] * 2, pair, drops) == (2, 0)
     assert drops[DropReason.PORT_DOWN] == 2
 
 
 @KINDS
 def test_one_frame_that_is_too_long_does_not_stop_the_others(kind: Make, pair: Pair) -> None:
     pair[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8_192)
-    batch, drops = kind(65_000), no_drops()
-    fill(batch, [b"a", bytes(60_000), b"b"])
-    assert batch.forward(pair[0], 0, 3, MACS, drops) == 2
-    assert received(pair[1]) == [ETHER + b"a", ETHER + b"b"]
+    drops, frames = no_drops(), [data(payload=b"a"), data(payload=bytes(60_000)), data(payload=b"b")]
+    assert forwarded(kind(65_000), frames, pair, drops) == (3, 2)
+    assert received(pair[1]) == [one_less(frames[0]), one_less(frames[2])]
     assert drops[DropReason.TOO_BIG] == 1
 
 
