@@ -10,14 +10,15 @@
 *frames/s* is the best of some tries at full speed that lose less than 0.1 %, and whose last frame comes at once: a rate
 that only fills queues does not count. Both forward in the sender's own time, so no rate needs to be searched. *RTT* is
 of single frames between endpoints that wait for them as nodes do. All frames leave through AF_PACKET, which no offload
-touches. Of other planes and of the kernel's IPv4 docs/explanation/design.md has what led to the choice.
+touches. Switches with the plane ``raw`` lose what exceeds them, so the processor time of the first one counts there. Of
+other planes and of the kernel's IPv4 docs/explanation/design.md has what led to the choice.
 """
 
 from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Final
@@ -34,8 +35,8 @@ from lab.namespaces import mac_addresses
 from lab.process import FailedError, LabProcess, new_run
 from lab.topology import chain
 
-KERNEL, BRIDGE = "kernel", "bridge"
-RATE, LOSS = "frames/s", "loss %"
+KERNEL, BRIDGE, RAW, RAW_PYTHON = "kernel", "bridge", "raw", "raw, Python twins"
+RATE, LOSS, CORE = "frames/s", "loss %", "frames/s of a core"
 TRIP, TRIP_P99 = "RTT median, µs", "RTT p99, µs"
 SIZE: Final = 1_400  # bytes, the Ethernet header included
 CASE: Final = f"{SIZE:,} B, 3 switches"
@@ -74,28 +75,29 @@ class Row(Lab):
         self._sink.read(_READY_S)
 
     @contextmanager
-    def kernel(self) -> Iterator[Mapping[str, str]]:
-        """Run a switch of this project in every middle; yield a frame there and one back, each in hex."""
+    def switches(self, plane: str, *environment: str) -> Iterator[tuple[Mapping[str, str], list[LabProcess]]]:
+        """Run a switch of this project in every middle; yield a frame there and one back, each in hex, and these."""
         with ExitStack() as undo:
             workers = []
             for node in self.topology.nodes[1:-1]:
                 left, right = self.topology.neighbours(node)
                 ways = {side: f"{at} {self._macs[at][node].hex()}" for side, at in (("left", left), ("right", right))}
-                workers.append(undo.enter_context(self._worker(node, "switch", ways=ways)))
+                settings = {"ways": ways, "plane": plane}
+                workers.append(undo.enter_context(self._worker(node, "switch", environment, **settings)))
             for worker in workers:
                 worker.read(_READY_S)
-            yield self._frames(1)
+            yield self._frames(1), workers
 
     @contextmanager
-    def bridge(self) -> Iterator[Mapping[str, str]]:
-        """Make a bridge in every middle, which has learnt both addresses; yield as ``kernel``."""
+    def bridge(self) -> Iterator[tuple[Mapping[str, str], list[LabProcess]]]:
+        """Make a bridge in every middle, which has learnt both addresses; yield as ``switches``, without these."""
         with ExitStack() as undo:
             for node in self.topology.nodes[1:-1]:
                 self.namespaces[node].bridge(_BRIDGE, self.topology.neighbours(node))
                 undo.callback(self.namespaces[node].configure, [f"link del dev {_BRIDGE}"])
             frames = self._frames(4)
             self.round_trips(frames, _WARM_UP_PINGS)
-            yield frames
+            yield frames, []
 
     def flat_out(self, frames: Mapping[str, str], seconds: float) -> dict[str, float]:
         """Send at full speed for a while; return rate and loss. Raises ``FailedError``: a process ended."""
@@ -127,13 +129,22 @@ class Row(Lab):
             found[name] = data_frame(macs, SIZE, *names).hex()
         return found
 
-    def _worker(self, node: str, role: str, **settings: object) -> LabProcess:
-        return self.start(node, role, ["-m", "forwarding_end", role, json.dumps(settings)], has_orders=True)
+    def _worker(self, node: str, role: str, environment: Sequence[str] = (), **settings: object) -> LabProcess:
+        argv = ["-m", "forwarding_end", role, json.dumps(settings)]
+        return self.start(node, role, argv, environment, has_orders=True)
 
 
 def measure_one(row: Row, baseline: str, seconds: float, pings: int, _: int) -> dict[str, float]:
     """Return the figures of one baseline, by column. Raises ``FailedError``: it is not available, or loses frames."""
-    with row.kernel() if baseline == KERNEL else row.bridge() as frames:
+    if baseline in (RAW, RAW_PYTHON):
+        with row.switches("raw", *(["GDP_BURST=python"] if baseline == RAW_PYTHON else [])) as (frames, workers):
+            trips = row.round_trips(frames, pings)
+            before = workers[0].ask(do="count")
+            row.flat_out(frames, seconds)
+            after = workers[0].ask(do="count")
+        rate = (after["forwarded"] - before["forwarded"]) / (after["cpu_s"] - before["cpu_s"])
+        return {CORE: rate, TRIP: statistics.median(trips), TRIP_P99: percentile(trips, 0.99)}
+    with row.switches("kernel") if baseline == KERNEL else row.bridge() as (frames, _workers):
         trips = row.round_trips(frames, pings)
         tries = [row.flat_out(frames, seconds) for _ in range(TRIES)]
     best = max(tries, key=lambda each: each[RATE])
@@ -143,14 +154,14 @@ def measure_one(row: Row, baseline: str, seconds: float, pings: int, _: int) -> 
 
 
 def measure(options: Options) -> Outcome:
-    """Measure both, round by round."""
+    """Measure all, round by round."""
     recorder, pings = Recorder(), int(options.pings)
     with new_run() as run, ExitStack() as stack:
         row = Row(run, stack)
-        columns = (RATE, LOSS, TRIP, TRIP_P99)
+        columns = (RATE, CORE, LOSS, TRIP, TRIP_P99)
         trials = [
             Trial(CASE, name, columns, partial(measure_one, row, name, options.seconds, pings))
-            for name in (KERNEL, BRIDGE)
+            for name in (KERNEL, BRIDGE, RAW, RAW_PYTHON)
         ]
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
@@ -164,6 +175,7 @@ def measure(options: Options) -> Outcome:
     targets = [
         over.ratio(f"{CASE}: kernel / bridge, frames/s", KERNEL, BRIDGE, CASE, RATE, GAIN),
         over.ratio(f"{CASE}: kernel / bridge, RTT median", KERNEL, BRIDGE, CASE, TRIP, None, at_most=True),
+        over.ratio(f"{CASE}: raw / with Python twins, frames/s of a core", RAW, RAW_PYTHON, CASE, CORE, None),
     ]
     return Outcome("forwarding", "Forwarding", over, targets, settings)
 

@@ -24,6 +24,7 @@ from gdp.errors import LocalError
 from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.mmsg import SLOTS, make_batch
+from gdp.ports.raw import RawPlane
 from gdp.ports.sockets import kernel_drops
 from gdp.switch.table import Table
 
@@ -133,22 +134,28 @@ def answer_pings(ifname: str, frame: bytes, pings: int) -> dict[str, int]:
     return {"answered": answered}
 
 
-def switch(ways: dict[str, str]) -> None:
-    """Forward by a static table until stdin closes.
+def switch(ways: dict[str, str], plane: str) -> None:
+    """Forward by a static table until stdin closes; answer each line with frames sent on and the processor time.
 
     ``ways``: the devices towards the source ("left") and the sink ("right"), each "device neighbour's-MAC" in hex.
     """
     left, right = (ways[side].split() for side in ("left", "right"))
     table = Table(_ENTRIES_MAX)
     try:
-        made = KernelPlane([left[0], right[0]], table, entries_max=_ENTRIES_MAX)
+        ports = left[0], right[0]
+        made = RawPlane(ports, table) if plane == "raw" else KernelPlane(ports, table, entries_max=_ENTRIES_MAX)
     except LocalError as error:
         say(refused_because=str(error))
         return
     own = {port.ifname: port for port in made.ports.values()}
     for name, (ifname, mac) in ((SINK, right), (SOURCE, left)):
         table.install(name, ((own[ifname].index, bytes.fromhex(mac) + own[ifname].mac),), _LEASE_S)
-    made.watch(sys.stdin, sys.exit)
+
+    def answer() -> None:
+        read_order()  # ends the process where there is none
+        say(forwarded=made.counters.forwarded, cpu_s=time.process_time())
+
+    made.watch(sys.stdin, answer)
     say(event="ready")
     with closing(made):
         while True:
