@@ -69,15 +69,11 @@ def _traffic_class_of(frame: bytes) -> TrafficClass:
 class RawPlane(NetdevPlane):
     """``Plane`` over AF_PACKET.
 
-    Args:
-        bypass_qdisc: send past traffic control.
-
     Raises:
         LocalError: as ``add_port``.
     """
 
-    def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None, *, bypass_qdisc: bool = False) -> None:
-        self._bypass_qdisc = bypass_qdisc
+    def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
         self._sockets_by_class: dict[TrafficClass, dict[int, socket.socket]] = {
             traffic_class: {} for traffic_class in _CLASSES
         }  # by port
@@ -99,7 +95,7 @@ class RawPlane(NetdevPlane):
 
     def _open_traffic_class(self, port: Port, traffic_class: TrafficClass, rank: int) -> None:
         sockets = self._sockets_by_class[traffic_class]
-        opened = sockets[port.index] = open_port(port.ifname, traffic_class, bypass_qdisc=self._bypass_qdisc)
+        opened = sockets[port.index] = open_port(port.ifname, traffic_class)
         if self._entries is None:
             keep_arrival_times(opened)
             ready: Callable[[], None] = partial(self._punt_all, port.index, opened)

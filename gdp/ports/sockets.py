@@ -37,7 +37,6 @@ NO_RAW_SOCKETS: Final = f"raw sockets need root or CAP_NET_RAW; {AS_ROOT}"
 
 _SOL_PACKET: Final = 263
 _PACKET_STATISTICS: Final = 6
-_PACKET_QDISC_BYPASS: Final = 20
 _PACKET_IGNORE_OUTGOING: Final = 23  # Linux 4.20; older kernels rely on the filter
 _SO_ATTACH_FILTER: Final = 26
 _SO_SNDBUFFORCE: Final = 32
@@ -156,14 +155,11 @@ def tell_neighbours(opened: socket.socket, traffic_class: TrafficClass, neighbou
     _filter(opened, steps_of(traffic_class, neighbours))
 
 
-def open_port(
-    ifname: str, traffic_class: TrafficClass = TrafficClass.ALL, *, bypass_qdisc: bool = False
-) -> socket.socket:
+def open_port(ifname: str, traffic_class: TrafficClass = TrafficClass.ALL) -> socket.socket:
     """Open a non-blocking socket for our EtherType on one device.
 
     Args:
         traffic_class: which of our frames it accepts.
-        bypass_qdisc: pass frames to the driver without traffic control; faster, but shaping (tc) is skipped too.
 
     Raises:
         LocalError: the process may not open raw sockets, or the device does not exist.
@@ -176,8 +172,6 @@ def open_port(
         attach_ethertype_filter(opened, traffic_class)
         if traffic_class in (TrafficClass.CONTROL, TrafficClass.HELLO, TrafficClass.URGENT):
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, _PRIORITY)
-        if bypass_qdisc:
-            opened.setsockopt(_SOL_PACKET, _PACKET_QDISC_BYPASS, 1)
         if traffic_class in (TrafficClass.HELLO, TrafficClass.GUEST):
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _GREETING_BUFFER_BYTES)
         else:

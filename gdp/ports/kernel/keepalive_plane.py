@@ -24,7 +24,6 @@ class KeepalivePlane(RawPlane):
 
     Args:
         sessions: of the kernel, which this plane closes; None: the node runs all.
-        bypass_qdisc: as of ``RawPlane``.
 
     Raises:
         LocalError: as ``add_port``.
@@ -36,13 +35,12 @@ class KeepalivePlane(RawPlane):
         table: Table | None = None,
         *,
         sessions: KeepaliveSessions | None,
-        bypass_qdisc: bool = False,
     ) -> None:
         self._sessions = sessions
         with ExitStack() as opened:
             if sessions is not None:
                 opened.enter_context(closing(sessions))
-            super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
+            super().__init__(ifnames, table)
             opened.pop_all()  # from now on ``close`` closes them
 
     @property

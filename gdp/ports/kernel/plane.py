@@ -41,7 +41,6 @@ class KernelPlane(KeepalivePlane):
         entries_max: most entries that the kernel holds; Python forwards by the others.
         peer: redirect to the other end of a veth pair where that is correct.
         clsact: attach by filters even if the kernel has links.
-        bypass_qdisc: send frames of this process past traffic control.
 
     Raises:
         LocalError: as ``add_port``; or the kernel refuses the program, with the reason.
@@ -55,7 +54,6 @@ class KernelPlane(KeepalivePlane):
         entries_max: int = ENTRIES_DEFAULT,
         peer: bool = True,
         clsact: bool = False,
-        bypass_qdisc: bool = False,
     ) -> None:
         self._peer = peer
         self._attachments: dict[int, Attachment] = {}
@@ -70,7 +68,7 @@ class KernelPlane(KeepalivePlane):
             self._queues = opened.enter_context(closing(Notifications(TRAFFIC_GROUP)))
             self._mirror = MapSync(table, *self._loaded.of_entries)
             sessions = None if self._loaded.is_leased else open_sessions()
-            super().__init__(ifnames, table, sessions=sessions, bypass_qdisc=bypass_qdisc)
+            super().__init__(ifnames, table, sessions=sessions)
             opened.pop_all()  # from now on ``close`` closes them
         self.watch(self._queues, self._review_queues)
         if table is not None:
