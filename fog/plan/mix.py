@@ -42,7 +42,7 @@ class Mix:
     usd_per_hour: float
 
 
-def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = (), least: int = 1) -> Mix:
+def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = ()) -> Mix:
     """Return the machines to add; among equal prices, the mix with fewer machines, then the safer one.
 
     Args:
@@ -56,7 +56,7 @@ def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = (
     if not 0 < target < 1:
         raise LocalError(f"target {target:g}: expected a number between 0 and 1")
     already = joint(have)
-    minimum = max(0, least - len(have))
+    minimum = 0 if have else 1
     most = [max(minimum, _alone(kind, target, already)) for kind in kinds]
     if math.prod(each + 1 for each in most) > _MOST_MIXES:
         raise LocalError(f"up to {most} machines of {len(kinds)} kinds: ask for fewer kinds, or for less")

@@ -92,9 +92,7 @@ def prefer_server(token: JoinToken, server: str) -> JoinToken:
     return replace(token, servers=(server, *(each for each in token.servers if each != server)))
 
 
-def join_domain(
-    request: JoinRequest, *, clock: Callable[[], float] = time.time, wait: Callable[[float], None] = time.sleep
-) -> Joined:
+def join_domain(request: JoinRequest, *, wait: Callable[[float], None] = time.sleep) -> Joined:
     """Join the token's domain and write the machine's directory; repeats a request whose response was lost.
 
     Raises:
@@ -113,7 +111,7 @@ def join_domain(
         fields, root, server = _ask(request, [keys for _, keys in members], wait)
         reserved.unlink()
         request = replace(request, token=prefer_server(request.token, server))
-        identities, borders = _install(draft, request, members, fields, root, clock())
+        identities, borders = _install(draft, request, members, fields, root, time.time())
         record = own_record(identities[0], max(len(request.uplinks), 1), ())
         cards = tuple(read_public(draft / folder / CARD) for folder, _ in members)
         _announce(request, identities[-1], InstallRequest(cards, record.wire), wait)

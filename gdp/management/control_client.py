@@ -216,33 +216,22 @@ class NodeConnection(ClosedOnExit):
             asked = {"from": page["next"], "until": page["until"]}
         return head, blocks
 
-    def read_result(self, timeout_s: float | None = None) -> Mapping[str, object]:
-        """Return the next response's result.
-
-        Args:
-            timeout_s: seconds to wait; None: that of the connection.
-
-        Raises:
-            TimeoutError: none came within ``timeout_s``, which was given.
-            LocalError: the node refused a request, ended or is silent.
-        """
-        response = next(self.responses(timeout_s), None)
+    def read_result(self) -> Mapping[str, object]:
+        """Return the next response's result. Raises ``LocalError``: the node refused a request, ended or is silent."""
+        response = next(self.responses(), None)
         if response is None:
             raise NodeEndedError(self._path)
         if not response.is_ok:
             raise LocalError(f"{self._path}: {response.error}")
         return response.result
 
-    def responses(self, timeout_s: float | None = None) -> Iterator[Response]:
-        """Yield each response until the node ends; ``timeout_s`` and errors as for ``read_result``."""
+    def responses(self) -> Iterator[Response]:
+        """Yield each response until the node ends; errors as for ``read_result``."""
         while True:
             while not self._received:
-                self._socket.settimeout(self._timeout_s if timeout_s is None else timeout_s)
                 try:
                     data = self._socket.recv(_RECEIVE_BYTES)
                 except OSError as error:
-                    if isinstance(error, TimeoutError) and timeout_s is not None:
-                        raise
                     raise _translated(error, self._path, self._timeout_s) from error
                 if not data:
                     return

@@ -73,14 +73,14 @@ def held_row(topic: Topic) -> TopicRow:
     )
 
 
-def rows_to_fields(rows: Iterable[TopicRow], mono_s: float, limit: int = ROWS_MAX) -> dict[str, object]:
-    """Return the response's fields; above the limit the rows with the fewest messages are left out, and counted.
+def rows_to_fields(rows: Iterable[TopicRow], mono_s: float) -> dict[str, object]:
+    """Return the response's fields; above ``ROWS_MAX`` the rows with the fewest messages are left out, and counted.
 
     Args:
         mono_s: monotonic second of the counts; all processes of a host share that clock.
     """
     ordered = sorted(rows, key=lambda row: row.messages or 0, reverse=True)
-    kept = [row.to_fields() for row in ordered[:limit]]
+    kept = [row.to_fields() for row in ordered[:ROWS_MAX]]
     return {"mono_s": mono_s, "topics": kept, "left_out": len(ordered) - len(kept)}
 
 

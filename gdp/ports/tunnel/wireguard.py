@@ -383,7 +383,6 @@ def open_wireguard(
     mtu: int,
     alias: str,
     backend: Backend = "auto",
-    fwmark: int = 0,
     uplink: str = "",
 ) -> WireGuardDevice:
     """Make a WireGuard device and switch it on; one that a dead run of this switch left is replaced.
@@ -395,7 +394,6 @@ def open_wireguard(
         inner: inner IPv6 address of this end.
         mtu: in bytes, at least 1280.
         alias: identifies the devices of this switch.
-        fwmark: mark of the outer packets; 0: none.
         uplink: device that outer packets leave by; they have a mark of their own then. Empty: routing decides.
 
     Raises:
@@ -415,7 +413,7 @@ def open_wireguard(
             mtu=mtu,
             keeper=keeper,
             control=control,
-            fwmark=mark_of(ifname) if uplink else fwmark,
+            fwmark=mark_of(ifname) if uplink else 0,
         )
     except BaseException:
         keeper.close()

@@ -96,7 +96,7 @@ def test_machines_that_run_already_count() -> None:
     spot = Kind("spot", 0.1, 1.0)
     assert cheapest_mix((spot,), 0.001, have=[0.1, 0.1]).more == (1,)
     assert cheapest_mix((spot,), 0.001, have=[0.0001]).more == (0,)
-    assert cheapest_mix((spot,), 0.5, have=[0.1], least=3).more == (2,)
+    assert cheapest_mix((spot,), 0.5, have=[0.1]).more == (0,)
 
 
 @pytest.mark.parametrize(
