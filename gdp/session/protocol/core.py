@@ -105,9 +105,6 @@ class SessionCore:
         topics: the delegations of the node.
         random_start: returns 64 random bits, for the numbers of calls.
         delegations_at: location of the delegations, for errors.
-
-    Attributes:
-        malformed: messages that were dropped because their content was malformed.
     """
 
     def __init__(
@@ -125,7 +122,6 @@ class SessionCore:
         self._clients: dict[Name, ClientCore] = {}
         self._servers: dict[Name, ServerCore] = {}
         self._services: list[_Service] = []
-        self.malformed = 0
 
     # names
 
@@ -256,8 +252,8 @@ class SessionCore:
                 continue  # it arrived during the close of its subscription
             try:
                 receiver.receive(message, now_s)
-            except RemoteError:
-                self.malformed += 1
+            except RemoteError as error:
+                self.member.subscriptions.drops[error.reason] += 1
         for service in self._services:
             due_s = service.get_timer()
             if due_s is not None and now_s >= due_s:

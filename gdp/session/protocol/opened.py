@@ -13,7 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.client.send_options import Priority, SendOptions, checked, is_urgent
-from gdp.errors import GdpError, LocalError
+from gdp.errors import DropReason, GdpError, LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.replication import Replication
@@ -424,7 +424,10 @@ class BaseSubscription(Opened[_D]):
             self._driver.run(partial(self._session.core.unsubscribe, self._inbox))
 
     def _no_message(self, timeout_s: float | None) -> SessionTimeoutError:
-        hint = self._session.why_not(self.name, f"{self.publishers} publisher(s) are there")
+        drops = self._session.core.member.subscriptions.drops
+        unread = drops[DropReason.MALFORMED] + drops[DropReason.BAD_VERSION]
+        foreign = f", and {unread} messages that no session sent" if unread else ""
+        hint = self._session.why_not(self.name, f"{self.publishers} publisher(s) are there{foreign}")
         return SessionTimeoutError(f"{self._label}: no message within {timeout_s:g} s{hint}")
 
     def _closed(self) -> ClosedError:

@@ -6,7 +6,7 @@ import pytest
 
 import gdp
 from gdp.client.send_options import SendOptions
-from gdp.errors import LocalError
+from gdp.errors import DropReason, LocalError
 from gdp.message.loss import LossReason
 from gdp.metadata import Metadata
 from gdp.names import Name
@@ -55,6 +55,18 @@ def test_a_receive_that_times_out_says_how_many_publishers_are_there(pair: Simul
     _, subscription = crossing(pair)
     with pytest.raises(gdp.SessionTimeoutError, match=r"/camera: no message within 0.5 s; 1 publisher\(s\)"):
         subscription.receive(0.5)
+
+
+def test_what_no_session_sent_is_counted_and_said(pair: Simulated) -> None:
+    publisher, subscription = crossing(pair)
+    for message in (b"short", b"\x07" + bytes(20)):
+        publisher._publisher.publish(message)
+    with pytest.raises(gdp.SessionTimeoutError, match=r"1 publisher\(s\) are there, and 2 messages that no session"):
+        subscription.receive(0.5)
+    drops = pair.sessions["server"].core.member.drops()
+    assert (drops[DropReason.MALFORMED], drops[DropReason.BAD_VERSION]) == (1, 1)
+    publisher.put(b"good")
+    assert subscription.receive(5).payload == b"good"
 
 
 def test_a_publisher_without_readers_says_what_to_do(pair: Simulated) -> None:
