@@ -34,10 +34,9 @@ BY_BOTH: Final = Weights()
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Chosen offer, and the reason; ``score``: USD per hour including the price of the latency; lower is better."""
+    """Chosen offer, and the reason."""
 
     offer: Offer
-    score: float
     why: str
 
 
@@ -83,15 +82,13 @@ def _best(
         raise LocalError(_nearest(wanted, allowed, offers))
     slowest_ms = max(latency_ms.values(), default=0.0)
 
-    def score(offer: Offer) -> float:
-        return offer.usd_per_hour + weights.usd_per_hour_per_ms * latency_ms.get(offer.region, slowest_ms)
-
     def order(offer: Offer) -> tuple[bool, int, float, str, str]:
         taken = regions[offer.region] if weights.spreads else 0
-        return offer.region in avoid, taken, score(offer), offer.region, offer.type_name
+        usd_per_hour = offer.usd_per_hour + weights.usd_per_hour_per_ms * latency_ms.get(offer.region, slowest_ms)
+        return offer.region in avoid, taken, usd_per_hour, offer.region, offer.type_name
 
     best = min(fitting, key=order)
-    return Choice(best, score(best), _why(best, fitting, wanted, latency_ms, regions, avoid))
+    return Choice(best, _why(best, fitting, wanted, latency_ms, regions, avoid))
 
 
 def _why(

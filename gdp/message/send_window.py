@@ -46,7 +46,6 @@ class SendWindow:
         cache: what can be sent again.
         unsent: numbers of messages with a fragment that was never sent, and the first such one, oldest first.
         retransmissions: fragments that were sent again.
-        evicted: messages removed from a full window before every reader had them.
     """
 
     def __init__(
@@ -71,7 +70,6 @@ class SendWindow:
         self._sent_before = 0  # messages before this one were sent, if under an old number
         self.governing: bytes | None = None
         self.retransmissions = 0
-        self.evicted = 0
 
     def has_space(self) -> bool:
         """Return whether ``add`` would evict no message that a reader waits for."""
@@ -122,8 +120,6 @@ class SendWindow:
             if oldest >= self.readers.least():
                 evicted.append(oldest)
             self._release([oldest])
-        if evicted:
-            self.evicted += len(evicted)
         self._newest = number
         self.cache.add(number, frames, size, self._now_s if added_s is None else added_s)
         self.unsent.append((number, 0))

@@ -19,8 +19,8 @@ def message(number: int, parts: int) -> list[bytes]:
     return [number.to_bytes(4, "big") + part.to_bytes(4, "big") + bytes(PART - 8) for part in range(parts)]
 
 
-def put(window: SendWindow, number: int, frames: list[bytes]) -> None:
-    window.add(number, frames, size(frames))
+def put(window: SendWindow, number: int, frames: list[bytes]) -> list[int]:
+    return window.add(number, frames, size(frames))
 
 
 def window_of(messages: int, parts: int, readers: tuple[bytes, ...] = (A,), keep_last: int = 0) -> SendWindow:
@@ -227,9 +227,8 @@ def test_a_full_window_says_so_and_lets_the_oldest_go_at_twice_its_budget() -> N
         assert window.has_space()
         put(window, number, message(number, 1))
     assert not window.has_space()
-    for number in range(11, 26):
-        put(window, number, message(number, 1))
-    assert window.evicted == 5
+    evicted = [each for number in range(11, 26) for each in put(window, number, message(number, 1))]
+    assert evicted == [1, 2, 3, 4, 5]
     assert window.cache.held_bytes <= 20 * PART
     assert window.cache.oldest == 6
 
