@@ -315,7 +315,8 @@ static Py_ssize_t forward_run(const Receiver *self, char *slot, const int *sizes
     }
     Py_ssize_t hop_count = hops == NULL ? 0 : PyTuple_Size(hops);
     for (Py_ssize_t each = 0; hop_count == 0 && left >= 0 && each < count; each++) {
-        PyObject *done = PyObject_CallFunction(callbacks[1], "y#", slot + each * self->slot_bytes, (Py_ssize_t)(ETHER + sizes[each]));
+        const char *frame = slot + each * self->slot_bytes;
+        PyObject *done = PyObject_CallFunction(callbacks[1], "y#", frame, (Py_ssize_t)(ETHER + sizes[each]));
         left = done == NULL ? -1 : 0;
         Py_XDECREF(done);
     }
