@@ -10,7 +10,8 @@ With ``bridged`` the direct path is as long as the other one: three more namespa
 
     a -- p1 -- p2 -- p3 -- b      direct
 
-The overlay may be the ring with its three trust domains instead, of which A is nuc1 and B is nuc5.
+The overlay may be the ring with its three trust domains instead, of which A is nuc1 and B is nuc5. Else A and B have a
+processor each, as two machines have: Linux lets the sender's frames wake the far proxy on the sender's processor.
 
 A node is started ``direct`` or not. Direct nodes meet over the cable, in a ROS domain of their own. The others have a
 domain for each end, so that nothing but the proxies joins them, and reach their proxy inside their namespace.
@@ -23,6 +24,7 @@ then dominate the time. ROS 2's guide to tuning recommends the same.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from itertools import pairwise
@@ -82,14 +84,15 @@ class Row(UndoneOnExit):
             self._lab.namespaces[node].bridge(_BRIDGE, (before, after))
         for side, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
             self._lab.namespaces[self._machines[side]].configure([f"addr add {_ADDRESSES[side]}/24 dev {device}"])
+        cores = sorted(os.sched_getaffinity(0)) if ring is None else []
+        self._cores = {LEFT: cores[:1], RIGHT: cores[-1:]}
         with ExitStack() as undo:
             nodes = BenchNodes(self._lab, switches, plane="kernel", ready_s=READY_S, overlay=overlay)
             self._nodes = undo.enter_context(nodes)
             proxies = []
-            for side, node in self._machines.items():
+            for side in self._machines:
                 argv = ["-m", "proxy.cli.proxy", "--config", self._admit(side, carried)]
-                environment = self._environment(_DOMAINS[side])
-                proxies.append(undo.enter_context(self._lab.start(node, "proxy", argv, environment)))
+                proxies.append(undo.enter_context(self._start(side, "proxy", argv, self._environment(_DOMAINS[side]))))
             for proxy in proxies:
                 proxy.read_line(READY_S)
             self._proxies = [each.pid for each in proxies]
@@ -101,9 +104,14 @@ class Row(UndoneOnExit):
 
     def process(self, side: str, what: str, arguments: Sequence[str], *, direct: bool) -> LabProcess:
         """Start a Python process with a ROS node at A or B."""
-        node = self._machines[side]
         environment = self._environment(DIRECT_DOMAIN if direct else _DOMAINS[side])
-        return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(side)}"])
+        return self._start(side, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(side)}"])
+
+    def _start(self, side: str, what: str, arguments: Sequence[str], environment: Sequence[str]) -> LabProcess:
+        started = self._lab.start(self._machines[side], what, arguments, environment)
+        if self._cores[side]:
+            os.sched_setaffinity(started.pid, self._cores[side])
+        return started
 
     def proxies_cpu_s(self) -> float:
         """Return the processor time that both proxies have used."""
