@@ -19,6 +19,7 @@ from contextlib import closing
 from typing import Any, Final
 
 from peers.jsonl import order_waits, read_order, run_role, say
+from thin_link.relay import open_device
 
 from gdp.errors import LocalError
 from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
@@ -29,11 +30,9 @@ from gdp.ports.sockets import kernel_drops
 from gdp.switch.table import Table
 
 SOURCE, SINK = bytes([0xA0]) * 32, bytes([0xB0]) * 32  # names with entries at every switch
-_SOL_PACKET, _QDISC_BYPASS = 263, 20
-_SO_ATTACH_FILTER, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE = 26, 32, 33
+_SO_ATTACH_FILTER: Final = 26
 _RETURN: Final = 0x06  # BPF_RET | BPF_K
-_BUFFER_BYTES: Final = 64 << 20
-_SLOT_BYTES: Final = 64  # bytes that the sink reads of a frame
+_SLOT_BYTES: Final = 64  # bytes that the kernel keeps of a frame for the sink, which copies no more
 _NAP_S: Final = 0.0005
 _SILENCE_S: Final = 0.2
 _PATIENCE_S: Final = 1.0
@@ -44,33 +43,11 @@ _ENTRIES_MAX: Final = 1_024
 _LEASE_S: Final = 1e9
 
 
-def open_end(ifname: str, *, receives: bool = True, cut_bytes: int = 0) -> socket.socket:
-    """Open a socket that does not block.
-
-    ``cut_bytes``: keep so much of each frame (0: all), so that long ones are not copied. Raises ``OSError``: no such
-    device, or not allowed.
-    """
-    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
-    try:
-        opened.setsockopt(_SOL_PACKET, _QDISC_BYPASS, 1)
-        for force in (_SO_SNDBUFFORCE, _SO_RCVBUFFORCE):
-            opened.setsockopt(socket.SOL_SOCKET, force, _BUFFER_BYTES)
-        if cut_bytes:
-            step = array("B", struct.pack("=HBBI", _RETURN, 0, 0, cut_bytes))
-            opened.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", 1, step.buffer_info()[0]))
-        opened.setblocking(False)
-        opened.bind((ifname, ETHERTYPE if receives else 0))
-    except OSError:
-        opened.close()
-        raise
-    return opened
-
-
 def send(ifname: str, frame: bytes, seconds: float) -> dict[str, float]:
     """Send a whole frame again and again, flat out; return how often, and when it began and ended (monotonic)."""
     batch, head, drops = make_batch(len(frame)), frame[:ETHER_BYTES], [0] * 64
     frames = [frame[ETHER_BYTES:]] * SLOTS
-    with open_end(ifname, receives=False) as sock:
+    with open_device(ifname, 0) as sock:
         sent, start_s = 0, time.monotonic()
         while time.monotonic() < start_s + seconds:
             sent += batch.send(sock, frames, head, drops)
@@ -84,7 +61,9 @@ def count_frames(ifname: str) -> dict[str, float]:
     """
     expected, got, last_s, asked_s = None, 0, 0.0, 0.0
     batch = make_batch(_SLOT_BYTES)
-    with open_end(ifname, cut_bytes=_SLOT_BYTES) as sock:
+    step = array("B", struct.pack("=HBBI", _RETURN, 0, 0, _SLOT_BYTES))
+    with open_device(ifname, ETHERTYPE) as sock:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", 1, step.buffer_info()[0]))
         say(event="ready")
         while True:
             came = len(batch.receive(sock))
@@ -104,7 +83,7 @@ def ping(ifname: str, frame: bytes, pings: int) -> dict[str, list[float]]:
     Lost frames are left out. The function gives up after three lost frames.
     """
     times, lost, memory, now = list[float](), 0, bytearray(_FRAME_MAX), time.perf_counter
-    with open_end(ifname) as sock:
+    with open_device(ifname, ETHERTYPE) as sock:
         sock.settimeout(_PATIENCE_S)
         while len(times) < pings + _WARM and lost < _LOST_MAX:
             start = now()
@@ -121,7 +100,7 @@ def ping(ifname: str, frame: bytes, pings: int) -> dict[str, list[float]]:
 def answer_pings(ifname: str, frame: bytes, pings: int) -> dict[str, int]:
     """Answer as many pings as ``ping`` sends, with ``frame``, or until none comes for a while; return their number."""
     answered, memory = 0, bytearray(_FRAME_MAX)
-    with open_end(ifname) as sock:
+    with open_device(ifname, ETHERTYPE) as sock:
         sock.settimeout(_PATIENCE_S)
         say(event="ready")
         while answered < pings + _WARM:

@@ -2,7 +2,8 @@
 
 Rows in virtual time are the product's own protocol cores in the simulated ring: the robot at nuc1 behind 10 Mbit/s, the
 holder at nuc3. It publishes pictures of 40 kB at 10 Hz. What the bytes need is the time in which an ideal uplink, up
-and down at the same seconds, would have carried the same bytes. Ingest is in processor time of one core.
+and down at the same seconds, would have carried the same bytes. Ingest is in processor time of one core. What an
+upload costs live traffic is measured with real processes alone.
 
 .venv/bin/python scripts/bench/memory.py
 .venv/bin/python scripts/bench/memory.py --quick --no-save
@@ -40,28 +41,28 @@ from gdp.session.protocol.client_core import CALL_TIMEOUT_S, Call, ClientCore
 from gdp.stores.capsule_store import CapsuleStore
 from gdp.trust.right import Right
 from tests.journeys.capsules import LIMITS, STORE, Holder, Keeping, read_from
-from tests.journeys.flows import ROBOT, SERVER, Flow, advertise, ring
+from tests.journeys.flows import ROBOT, advertise, ring
 
 HOLDER, DESK = "nuc3/store", "nuc3/desk"
 UPLINK_BYTES_S: Final = 1_250_000
 FIFO_S: Final = 0.5
 RING_BYTES: Final = 1 << 32  # more than an hour of pictures
-IMAGE_BYTES, IMAGE_HZ, CMD_HZ = 40_000, 10, 20
+IMAGE_BYTES, IMAGE_HZ = 40_000, 10
 FRAME_BYTES, RTT_S = 1_400, 0.06
 MARKER: Final = b"the robot is in the laboratory"
 CASE: Final = "history"
 
 
-def site(folder: Path, *, keeps: bool = True, is_reliable: bool = True) -> tuple[Flow, Keeping | None, Holder]:
-    """Return the ring with a robot behind its uplink, what it keeps, and a holder."""
+def site(folder: Path) -> tuple[Keeping, Holder]:
+    """Return what a robot behind its uplink keeps, and a holder, in the ring."""
     world = ring(lease_s=ADVERTISEMENT.lease_s, keepalive_ms=None)
     for label in (HOLDER, DESK):
         world.add_member(label, "nuc3")
     assert world.run_until_attached()
     world.leads[ROBOT].bytes_s, world.leads[ROBOT].fifo_s = UPLINK_BYTES_S, FIFO_S
-    flow = advertise(world, "/camera", reliable=is_reliable)
+    flow = advertise(world, "/camera")
     holder = Holder(world, folder / "holder", HOLDER, limits=replace(LIMITS, owner_bytes=RING_BYTES))
-    return flow, Keeping(flow, folder / "robot", RING_BYTES) if keeps else None, holder
+    return Keeping(flow, folder / "robot", RING_BYTES), holder
 
 
 def image(rng: random.Random, number: int) -> bytes:
@@ -87,9 +88,8 @@ def ideal_s(pieces: list[tuple[float, float]], cumulated: list[tuple[float, int]
 
 def history(options: Options, folder: Path, over: Rounds) -> tuple[Keeping, Holder]:
     """Run the robot for ``options.seconds`` with an uplink that is gone half the time."""
-    flow, keeping, holder = site(folder)
-    assert keeping is not None
-    world, rng, at_s, pieces = flow.world, random.Random(options.seed), 0.0, list[tuple[float, float]]()
+    keeping, holder = site(folder)
+    world, rng, at_s, pieces = keeping.flow.world, random.Random(options.seed), 0.0, list[tuple[float, float]]()
     begun_s = world.network.now.mono_s
     while at_s < options.seconds:
         down_s, up_s = rng.uniform(1, 30), rng.uniform(1, 30)
@@ -116,56 +116,6 @@ def history(options: Options, folder: Path, over: Rounds) -> tuple[Keeping, Hold
     files = [path.read_bytes() for path in (folder / "holder").rglob("*") if path.is_file()]
     over.add("ours", CASE, "readable bytes", float(sum(data.count(MARKER) * len(MARKER) for data in files)))
     return keeping, holder
-
-
-def live(options: Options, folder: Path, over: Rounds, *, keeps: bool) -> None:
-    """Measure commands to the robot and its pictures while it uploads what an outage has left, or has nothing to."""
-    flow, keeping, holder = site(folder, keeps=keeps, is_reliable=False)
-    world, rng, network = flow.world, random.Random(options.seed), flow.world.network
-    command = advertise(world, "/cmd_vel", SERVER, urgent=True)
-    command.read_by(ROBOT)
-    flow.read_by(SERVER)
-    assert network.run(10, lambda: flow.is_read_by(1) and command.is_read_by(1))
-    sent_s, ages = dict[bytes, float](), dict[str, list[float]]({"/camera": [], "/cmd_vel": []})
-    begin_s, end_s = options.outage + 5, options.outage + 5 + options.live
-
-    def publish(to: Flow, message: bytes) -> None:
-        sent_s[message[:12]] = network.now.mono_s
-        to.publish(message)
-
-    for number in range(int(end_s * IMAGE_HZ)):
-        network.call(number / IMAGE_HZ, partial(publish, flow, b"image %6d" % number + rng.randbytes(IMAGE_BYTES)))
-    for number in range(int(end_s * CMD_HZ)):
-        network.call(number / CMD_HZ, partial(publish, command, b"twist %6d" % number + bytes(40)))
-    network.call(0.5, partial(network.set_link, world.leads[ROBOT], up=False))
-    network.call(options.outage, partial(network.set_link, world.leads[ROBOT], up=True))
-    start_s, worked_s, backlog = network.now.mono_s, 0.0, list[int]()
-
-    def step() -> bool:
-        nonlocal worked_s
-        now_s = network.now.mono_s
-        for label, topic in ((ROBOT, command), (SERVER, flow)):
-            for message in world.members[label].poll_messages():
-                if keeping is not None and keeping.keeper.is_asked(message.topic):
-                    keeping.keeper.receive(message, now_s)
-                elif begin_s < sent_s[message.delivered.message[:12]] - start_s < end_s - 2:
-                    ages[topic.name].append(now_s - sent_s[message.delivered.message[:12]])
-        if now_s - worked_s > 0.005:
-            worked_s = now_s
-            holder.work()
-            if keeping is not None:
-                keeping.work()
-                backlog.append(keeping.kept.ring.end - keeping.kept.uploader.confirmed)
-        return False
-
-    for number in range(int(end_s * 20)):
-        network.call(number / 20, lambda: None)
-    network.run(end_s, step)
-    who = "while it uploads" if keeps else "without"
-    over.add(who, "live", "cmd_vel p99, ms", 1e3 * percentile(ages["/cmd_vel"], 0.99))
-    over.add(who, "live", "image age p50, ms", 1e3 * percentile(ages["/camera"], 0.5))
-    if keeps:
-        over.add(who, "live", "backlog at the end, MB", backlog[-1] / 1e6)
 
 
 def seeks(options: Options, keeping: Keeping, holder: Holder, over: Rounds) -> None:
@@ -293,17 +243,11 @@ def measure(options: Options) -> Outcome:
         seeks(options, keeping, holder, over)
         ingest(options, keeping, Path(disk) / "ingest", over)
         damages(options, keeping, over)
-        for keeps in (False, True):
-            progress("live traffic")
-            live(options, folder / f"live-{keeps}", over, keeps=keeps)
-    uploads, column = "while it uploads", "image age p50, ms"
     targets = [
         over.target("time / what the bytes need", "ours", CASE, "time / what the bytes need", 1.2, at_most=True),
         over.target("equal byte for byte", "ours", CASE, "equal byte for byte", 1),
         over.target("readable bytes before the grant", "ours", CASE, "readable bytes", 0, at_most=True),
         over.target("seek p99, ms", "ours", CASE, "seek p99, ms", 200, at_most=True),
-        over.difference("live cmd_vel p99, ms more", uploads, "without", "live", "cmd_vel p99, ms", 5),
-        over.ratio("live image age", uploads, "without", "live", column, 1.1, at_most=True),
         over.target("ingest, MB/s of a core", "ours", "holder", "ingest, MB/s", 100),
         over.target("disk / ciphertext", "ours", "holder", "disk / ciphertext", 1.05, at_most=True),
         over.target("damages named", "ours", "audit", "share of damages named", 1),
@@ -317,8 +261,8 @@ if __name__ == "__main__":
     parser = command_line(__doc__, seconds=3_600.0, seconds_of="of virtual time", quick=quick, has_record=True)
     for name, value, text in (
         ("seed", 1, "of all draws"),
-        ("outage", 30.0, "seconds of the outage before live traffic is measured"),
-        ("live", 15.0, "seconds of live traffic"),
+        ("outage", 30.0, "seconds of the outage before live traffic is measured, with --real"),
+        ("live", 15.0, "seconds of live traffic, with --real"),
         ("seeks", 100, "calls"),
         ("megabytes", 100, "of frames to ingest"),
         ("drawn", 1_000, "damages"),

@@ -12,7 +12,6 @@ column of its own: another address is set by one program, another network or pub
     sudo .venv/bin/python scripts/bench/survive.py                      # the whole; writes docs/benchmarks/survive.json
     sudo .venv/bin/python scripts/bench/survive.py --only silent --only cut --rounds 30 --no-save
     sudo .venv/bin/python scripts/bench/survive.py --only tunnels         # a robot's address changes: ten minutes
-    sudo .venv/bin/python scripts/bench/survive.py --only ribs --rounds 1 --dead-s 600 --no-save     # ten minutes
     sudo .venv/bin/python scripts/bench/survive.py --quick --no-save      # one round of each: does it work?
 """
 

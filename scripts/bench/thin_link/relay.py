@@ -44,7 +44,7 @@ MARKED_PORT: Final = 5_201  # of the TCP flow that is counted apart
 _ALL: Final = 3  # ETH_P_ALL
 _SOL_PACKET, _QDISC_BYPASS, _IGNORE_OUTGOING = 263, 20, 23
 _SEND_BUFFER_FORCE, _RECEIVE_BUFFER_FORCE = 32, 33
-_BUFFER_BYTES: Final = 32 << 20
+_BUFFER_BYTES: Final = 64 << 20
 _SLOT_BYTES: Final = 2_048
 _BATCHES: Final = 4  # of one direction before the other one has its turn
 _PRIORITY: Final = 20
@@ -157,14 +157,22 @@ class _Relay:
         self._drops, self._oversized = [0] * len(self._drops), 0
 
 
-def _open(device: str) -> socket.socket:
+def open_device(device: str, ethertype: int = _ALL) -> socket.socket:
+    """Open a socket that does not block, for frames of this type; 0: none comes.
+
+    Raises ``OSError``: no such device, or not allowed.
+    """
     opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
-    opened.setsockopt(_SOL_PACKET, _IGNORE_OUTGOING, 1)
-    opened.setsockopt(_SOL_PACKET, _QDISC_BYPASS, 1)
-    for force in (_SEND_BUFFER_FORCE, _RECEIVE_BUFFER_FORCE):
-        opened.setsockopt(socket.SOL_SOCKET, force, _BUFFER_BYTES)
-    opened.bind((device, _ALL))
-    opened.setblocking(False)
+    try:
+        opened.setsockopt(_SOL_PACKET, _IGNORE_OUTGOING, 1)
+        opened.setsockopt(_SOL_PACKET, _QDISC_BYPASS, 1)
+        for force in (_SEND_BUFFER_FORCE, _RECEIVE_BUFFER_FORCE):
+            opened.setsockopt(socket.SOL_SOCKET, force, _BUFFER_BYTES)
+        opened.bind((device, ethertype))
+        opened.setblocking(False)
+    except OSError:
+        opened.close()
+        raise
     return opened
 
 
@@ -188,7 +196,7 @@ def main() -> None:
     up, down = (each.channel(2 * seed + at) for at, each in enumerate(directions))
     one, other = settings["devices"]
     _be_first()
-    with _open(one) as robot, _open(other) as cloud:
+    with open_device(one) as robot, open_device(other) as cloud:
         relay = _Relay((robot, cloud), (up, down))
         say(event="ready")
         relay.run(sys.stdin.fileno())
