@@ -255,7 +255,9 @@ class PathController:
 
     def _no_queue_s(self) -> float:
         """Return up to which standing queue, in seconds, the path counts as empty."""
-        model, frames_s = self.model, max(self.model.bytes_s / self._mtu, 1.0)
+        # what a flow gets next to another one is less than the path carries: its few frames would seem to be the queue
+        capacity = 0.0 if self._cubic is None else self._capacity
+        model, frames_s = self.model, max(self.model.bytes_s / self._mtu, capacity / self._mtu, 1.0)
         # the base may be that of a short frame: what a full one takes to leave is no queue
         # and the least window of a lone flow on a thin path is no queue of another one
         most_s = max(_WANTED_MOST_S, _LEAST_FRAMES * self._mtu / (model.capacity_bytes_s or float("inf")))

@@ -36,11 +36,12 @@ def test_flows_over_thin_full_links_outlive_overlapping_faults(seed: int, tmp_pa
 
 
 @pytest.mark.nightly
-def test_images_at_the_pace_of_each_reader_starve_no_flow_over_full_links(tmp_path: Path) -> None:
-    plan = random_network(2, 8, rate=0.4, image_bits_s=IMAGE_SHARE * THIN_BITS_S)
-    faults = make_schedule(plan, 2, 12.0, kinds=SIMULATED)
+@pytest.mark.parametrize("seed", [2, 15])
+def test_images_at_the_pace_of_each_reader_starve_no_flow_over_full_links(seed: int, tmp_path: Path) -> None:
+    plan = random_network(seed, 8, rate=0.4, image_bits_s=IMAGE_SHARE * THIN_BITS_S)
+    faults = make_schedule(plan, seed, 12.0, kinds=SIMULATED)
     with signing_oracle():
-        chaos = SimulatedChaos(plan, faults, 2, options=SendOptions(own_pace=True))
+        chaos = SimulatedChaos(plan, faults, seed, options=SendOptions(own_pace=True))
         chaos.settle(thin_bits_s=THIN_BITS_S, fifo_s=FIFO_S)
         outlive(chaos, faults, LIMIT_S, WELL_S, tmp_path)
 
