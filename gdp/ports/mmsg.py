@@ -47,6 +47,11 @@ def send_failure(number: int) -> tuple[DropReason, bool]:
     return _SEND_ERRORS.get(number, (DropReason.PORT_DOWN, False))
 
 
+def _most_at_once(slot_bytes: int) -> int:
+    """Return how many frames one batch takes."""
+    return max(8, min(SLOTS, _TAKE_BYTES // slot_bytes))
+
+
 def _count_lost(drops: list[int], number: int, left: int) -> int:
     """Count the frames that are lost by the errno of a send, and return how many of those ``left`` these are."""
     reason, goes_on = send_failure(number)
@@ -99,7 +104,7 @@ class MmsgBatch:
         headers = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
         self._receive.argtypes, self._send.argtypes = (*headers, ctypes.c_void_p), headers
         self.slot_bytes = slot_bytes
-        self._take_max = max(8, min(SLOTS, _TAKE_BYTES // slot_bytes))
+        self._take_max = _most_at_once(slot_bytes)
         self.pool = bytearray(SLOTS * slot_bytes)
         self._head = bytearray(bytes(ETHER_BYTES - 2) + _ETHERTYPE)
         base = ctypes.addressof(ctypes.c_char.from_buffer(self.pool))
@@ -196,12 +201,12 @@ class MmsgBatch:
         return _send_all(send, first, end, drops)
 
 
-class CompiledBatch(MmsgBatch):
-    """``MmsgBatch`` over the burst core: frames stay where the kernel wrote them until they are read."""
+class CompiledBatch:
+    """As ``MmsgBatch``, over the burst core: frames stay where the kernel wrote them until they are read."""
 
     def __init__(self, slot_bytes: int) -> None:
-        super().__init__(slot_bytes)
-        self._receiver = burst.SYSTEM_CALLS.Receiver(slot_bytes, self._take_max)
+        self.slot_bytes = slot_bytes
+        self._receiver = burst.SYSTEM_CALLS.Receiver(slot_bytes, _most_at_once(slot_bytes))
 
     def receive_frames(self, source: socket.socket, port: int) -> Sequence[ReceivedFrame]:
         """Return the frames that arrived at a port's socket, as ``MmsgBatch``."""
@@ -231,6 +236,9 @@ def put_one(sink: socket.socket, frame: bytes | bytearray, macs: bytes, drops: l
     return 1
 
 
-def make_batch(slot_bytes: int) -> MmsgBatch:
+Batch = MmsgBatch | CompiledBatch
+
+
+def make_batch(slot_bytes: int) -> Batch:
     """Return a pool over the burst core in use."""
     return MmsgBatch(slot_bytes) if burst.SYSTEM_CALLS is None else CompiledBatch(slot_bytes)

@@ -33,7 +33,7 @@ from gdp.frame.codec import (
 )
 from gdp.intervals import Rate
 from gdp.names import NAME_BYTES
-from gdp.ports.mmsg import MmsgBatch, make_batch, put_one
+from gdp.ports.mmsg import make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.plane import MAC_BYTES, Port
 from gdp.ports.sockets import (
@@ -77,7 +77,7 @@ class RawPlane(NetdevPlane):
         self._sockets_by_class: dict[TrafficClass, dict[int, socket.socket]] = {
             traffic_class: {} for traffic_class in _CLASSES
         }  # by port
-        self._batch: MmsgBatch = make_batch(OVERHEAD_BYTES)
+        self._batch = make_batch(OVERHEAD_BYTES)
         self._neighbours: dict[int, frozenset[bytes]] = {}  # addresses, by port
         self._closing = Closing()
         self._resting: dict[int, tuple[socket.socket, float]] = {}  # sockets that pause until then, by file descriptor
@@ -222,7 +222,6 @@ class RawPlane(NetdevPlane):
     ) -> Callable[[], None]:
         """Return what receives one batch from a port, forwards it by ``sinks``, and punts the frames for the node."""
         counters, mtus, paces, came_by = self._counters, self._mtus, self._paces, self._came
-        other = partial(self._consider, entries, sides, port, sinks)
 
         def route(key: bytes, largest: int) -> Sequence[tuple[int, bytes]]:
             """Return the hops of frames whose key alone decides; none if one of the links is down or too narrow."""
@@ -238,39 +237,31 @@ class RawPlane(NetdevPlane):
                 leads.append((sinks[hop[0]].fileno(), hop[1]))
             return leads
 
-        def forward() -> None:
-            came, left = self._batch.forward(source, route, other, counters.drops)
-            counters.frames_in += came
-            came_by[port] += came
+        def consider(received: bytes) -> None:
+            """Decide on one frame with the reference, and act on the decision."""
+            decision = decide(received, entries, mtus, sides, port, paces)
+            if isinstance(decision, Drop):
+                counters.drops[decision.reason] += 1
+            elif isinstance(decision, Forward):
+                for reason in decision.lost:
+                    counters.drops[reason] += 1
+                frame = bytearray(received[ETHER_BYTES:])
+                frame[HOPS_AT] -= 1
+                count(sum(put_one(sinks[hop[0]], frame, hop[1], counters.drops) for hop in decision.hops))
+            else:
+                self._keep([ReceivedFrame(port, received[MAC_BYTES : 2 * MAC_BYTES], received[ETHER_BYTES:])])
+
+        def count(left: int) -> None:
             counters.forwarded += left
             counters.frames_out += left
 
-        return forward
+        def forward() -> None:
+            came, left = self._batch.forward(source, route, consider, counters.drops)
+            counters.frames_in += came
+            came_by[port] += came
+            count(left)
 
-    def _consider(
-        self,
-        entries: Mapping[bytes, Hops],
-        sides: Mapping[bytes, int],
-        port: int,
-        sinks: Mapping[int, socket.socket],
-        received: bytes,
-    ) -> None:
-        """Decide on one frame with the reference, and act on the decision."""
-        counters = self._counters
-        decision = decide(received, entries, self._mtus, sides, port, self._paces)
-        if isinstance(decision, Drop):
-            counters.drops[decision.reason] += 1
-        elif isinstance(decision, Forward):
-            for reason in decision.lost:
-                counters.drops[reason] += 1
-            frame = bytearray(received[ETHER_BYTES:])
-            frame[HOPS_AT] -= 1
-            for hop in decision.hops:
-                left = put_one(sinks[hop[0]], frame, hop[1], counters.drops)
-                counters.forwarded += left
-                counters.frames_out += left
-        else:
-            self._keep([ReceivedFrame(port, received[MAC_BYTES : 2 * MAC_BYTES], received[ETHER_BYTES:])])
+        return forward
 
 
 class Closing:

@@ -24,7 +24,7 @@ from thin_link.relay import open_device
 from gdp.errors import LocalError
 from gdp.frame.codec import ETHER_BYTES, ETHERTYPE
 from gdp.ports.kernel.plane import KernelPlane
-from gdp.ports.mmsg import SLOTS, make_batch
+from gdp.ports.mmsg import SLOTS, MmsgBatch, make_batch
 from gdp.ports.raw import RawPlane
 from gdp.ports.sockets import kernel_drops
 from gdp.switch.table import Table
@@ -60,7 +60,7 @@ def count_frames(ifname: str) -> dict[str, float]:
     The command ``expected`` states their number once the source is done. ``drops``: frames that found the buffer full.
     """
     expected, got, last_s, asked_s = None, 0, 0.0, 0.0
-    batch = make_batch(_SLOT_BYTES)
+    batch = MmsgBatch(_SLOT_BYTES)
     step = array("B", struct.pack("=HBBI", _RETURN, 0, 0, _SLOT_BYTES))
     with open_device(ifname, ETHERTYPE) as sock:
         sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", 1, step.buffer_info()[0]))

@@ -33,7 +33,7 @@ from report import percentile
 
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES
-from gdp.ports.mmsg import SLOTS, MmsgBatch, make_batch
+from gdp.ports.mmsg import SLOTS, MmsgBatch
 from gdp.ports.sockets import kernel_drops
 from thin_link.channel import Channel
 from thin_link.conditions import Direction
@@ -71,7 +71,7 @@ class _Relay:
     def __init__(self, sides: tuple[socket.socket, socket.socket], channels: tuple[Channel, Channel]) -> None:
         one, other = sides
         self._ways = (_Way(one, other, channels[0]), _Way(other, one, channels[1]))
-        self._batch: MmsgBatch = make_batch(_SLOT_BYTES)
+        self._batch = MmsgBatch(_SLOT_BYTES)
         self._drops = [0] * (max(DropReason) + 1)
         self._oversized = 0
         self._late_ns = array("q")  # of each frame since the last report
